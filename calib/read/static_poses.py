@@ -1,8 +1,9 @@
 """Static poses of logs: the arm at rest (`mjx_softarm.logs.rest`), to which equilibria are fitted.
 
 In a log of the control loop the pressures change until each arrival. There a pose is the window that ends
-with the arrival at a goal, if the springs are still over it by the loop's own rule. Windows after earlier
-actions do not count: 2 s after an action a twin's tip is 3 to 4 mm from its rest at the same springs.
+with the last row of a goal that stood, if the springs are still over it by the loop's own rule. Windows after
+earlier actions do not count: 2 s after an action a twin's tip is 3 to 4 mm from its rest at the same springs.
+The log does not tell two equal goals in a row apart, which give one pose.
 """
 
 from __future__ import annotations
@@ -12,10 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm.control import Gains
 from mjx_softarm.deploy.belief import still
-from mjx_softarm.deploy.controller import LOOP
+from mjx_softarm.deploy.controller import middle_kpa, rest_of
 from mjx_softarm.logs.rest import HOLD_KPA, NEEDED, holds, last_second, moves
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.policy.lag import law_lag_s
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.sensing.sensors import SensorFault
 from mjx_softarm.spec import ArmSpec
@@ -71,6 +75,7 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     row_uses = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
+    row_uses |= {"goal not held long enough": 0}
     found = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, row_uses)]
     n, n_springs = len(found), spec.n_springs
     # Stack the poses; pad the rows of readings.
@@ -138,17 +143,38 @@ def _rests(log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, 
 def _rests_of_loop(
     log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, int]
 ) -> Iterator[np.ndarray]:
-    """Find the rows of each rest in a log of the control loop: the window before its arrival at a goal."""
+    """Find the rows of each rest in a log of the control loop: the last window of each goal that stood."""
     assert log.goal is not None
-    n, readings = round(LOOP.window_s * spec.control.rate_hz), log.readings_of(spec.sensor)
+    n, config = rest_of(spec, _lag_s(spec))
+    readings = log.readings_of(spec.sensor)
     watched_m = log.spring_m if readings is None else spec.spring_sensor.lengths(readings, np.nan).length_m
-    ends = (log.goal[1:] != log.goal[:-1]).any(axis=1) & np.isfinite(log.goal[:-1, 0])
-    for last in [*np.flatnonzero(ends), len(log) - 1]:
-        rows = np.arange(max(last - n + 1, 0), last + 1)
-        if watched_m is not None and len(rows) == n and still(watched_m[rows]):
+    # A goal that stands for a window, and no longer than the payload; a moving goal has no such rows
+    asked = np.column_stack([log.goal, payload_kg])
+    cuts = np.flatnonzero((asked[1:] != asked[:-1]).any(axis=1)) + 1
+    for rows in np.split(np.arange(len(log)), cuts):
+        if len(rows) < n or np.isnan(log.goal[rows[0]]).any():
+            row_uses["goal not held long enough"] += len(rows)
+            continue
+        row_uses["goal not held long enough"] += len(rows) - n
+        rows = rows[-n:]
+        if watched_m is not None and still(watched_m[rows], config):
             yield rows
         else:
-            row_uses["tip still moving"] += len(rows)
+            row_uses["tip still moving"] += n
+
+
+def _lag_s(spec: ArmSpec) -> np.ndarray:
+    """Return the lags (n_springs, n_springs) [s] of the springs under the law, by the simulated arm."""
+    gains, n = Gains.from_spec(spec), spec.n_chambers
+
+    def springs(pressure_kpa: np.ndarray) -> np.ndarray:
+        found = settle_many(spec, pressure_kpa.reshape(-1, n))
+        known = (
+            np.asarray(found.settled).reshape(2, n).all(axis=0)
+        )  # else the chamber counts as moving nothing
+        return np.where(known[:, None], np.asarray(found.spring_m, float).reshape(2, n, -1), 0.0)
+
+    return law_lag_s(gains, springs, middle_kpa(gains, n))
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.control import LawState
+from mjx_softarm.control import Gains, LawState
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.lag import spring_lag_s
+from mjx_softarm.policy.lag import WayRule, spring_lag_s
 from mjx_softarm.policy.reachable import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.spec import ArmSpec
@@ -103,24 +103,50 @@ class Controller:
         """Make a policy ready; `plan` replaces its actor, for another way to find references."""
         # Times and lengths of this arm
         runner, gains = PolicyRunner(policy), policy.gains
-        middle_kpa = 0.5 * (gains.pressure_min_kpa + gains.pressure_max_kpa)
-        slowest_s = float(np.abs(np.linalg.eigvals(spring_lag_s(policy, middle_kpa))).max())
-        window_s = max(config.window_s, config.window_share * slowest_s)
+        window, config = rest_of(
+            policy.spec, spring_lag_s(policy, middle_kpa(gains, policy.spec.n_chambers)), config
+        )
         ahead_s = float(np.mean(gains.reference_s)) + 0.5 * config.rate_s
         lead_s = config.lead_actions * policy.action_s or ahead_s
-        radius_m = float(np.mean(policy.spec.per_section(policy.spec.geometry.spring_radius_m)))
-        still_m = config.still_m * radius_m / _STILL_RADIUS_M
 
         return cls(
             policy=policy,
             reachable=Reachable.from_poses(policy.workspace, policy.reward),
             plan=plan or (lambda pose, goal, _, sensed: runner.act(pose, goal, sensed).length_m),
             dt_s=1.0 / policy.rate_hz,
-            window=max(2, round(window_s * policy.rate_hz)),
+            window=window,
             observes_payload=policy.observation == "payload",
             lead_s=lead_s,
-            config=dataclasses.replace(config, still_m=still_m),
+            config=config,
         )
+
+    @property
+    def way_rule(self) -> WayRule:
+        """Numbers by which the error on the way of a moving goal is made up for."""
+        config = self.config
+        return WayRule(
+            self.policy.reward, self.dt_s, self.lead_s, config.way_share_per_s, config.max_shift[0]
+        )
+
+
+def middle_kpa(gains: Gains, n_chambers: int) -> np.ndarray:
+    """Return the pressures (n_chambers,) [kPa] in the middle of their range."""
+    return np.broadcast_to(0.5 * (gains.pressure_min_kpa + gains.pressure_max_kpa), n_chambers)
+
+
+def rest_of(spec: ArmSpec, lag_s: np.ndarray, config: LoopConfig = LOOP) -> tuple[int, LoopConfig]:
+    """Return the window [ticks] over which an arm's springs are watched, and the numbers with its `still_m`.
+
+    Args:
+        spec: arm.
+        lag_s (n_springs, n_springs) [s]: lags of its springs, of `mjx_softarm.policy.lag`.
+        config: numbers of the paper's arm.
+    """
+    slowest_s = float(np.abs(np.linalg.eigvals(lag_s)).max())
+    window_s = max(config.window_s, config.window_share * slowest_s)
+    radius_m = float(np.mean(spec.per_section(spec.geometry.spring_radius_m)))
+    still_m = config.still_m * radius_m / _STILL_RADIUS_M
+    return max(2, round(window_s * spec.control.rate_hz)), dataclasses.replace(config, still_m=still_m)
 
 
 class Command(NamedTuple):

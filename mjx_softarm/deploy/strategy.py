@@ -135,7 +135,7 @@ class Predicting(NamedTuple):
         # Lengths at the goal, of an arm whose shape lags and that has been beside its way
         controller, policy, pose = belief.controller, belief.controller.policy, belief.pose
         shift, length_m = self.shift, belief.spring_m
-        way = self.way.after(goal, pose - self.behind, controller)
+        way = self.way.after(goal, pose - self.behind, controller.way_rule)
         goal = goal + self.behind + way.correction
         for _ in range(policy.n_actions):
             length_m = _planned(belief, pose, goal + shift)
@@ -168,7 +168,7 @@ class Chasing(NamedTuple):
         controller, policy = belief.controller, belief.controller.policy
         shape = self.shape.after(policy, belief.spring_m, belief.pose, controller.dt_s)
         pose = belief.pose - shape.behind(policy, belief.spring_m, belief.pose)
-        after = self._replace(shape=shape, way=self.way.after(goal, pose, controller))
+        after = self._replace(shape=shape, way=self.way.after(goal, pose, controller.way_rule))
         # The action that is due
         waited_s = belief.command.n_ticks * controller.dt_s
         if belief.command.reference_m is not None and waited_s < policy.action_s:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.mdp.rewards import asked_error
+from mjx_softarm.control import Gains
+from mjx_softarm.mdp.rewards import RewardConfig, asked_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import Frame, even_pose, expected_springs
 from mjx_softarm.sensing.pose import pose_error
@@ -16,6 +19,13 @@ _LEAST_MODE = 1e-3  # response of a mode, in that of the largest, below which ch
 
 
 def spring_lag_s(policy: Policy, pressure_kpa: np.ndarray) -> np.ndarray:
+    """Return `law_lag_s` by a policy's own model of the springs."""
+    return law_lag_s(policy.gains, partial(expected_springs, policy.spring_model), pressure_kpa)
+
+
+def law_lag_s(
+    gains: Gains, springs: Callable[[np.ndarray], np.ndarray], pressure_kpa: np.ndarray
+) -> np.ndarray:
     """Return the matrix (n_springs, n_springs) [s] A of lags of the springs under the law.
 
     The law's integral changes by i' = ki C e, and moves the springs by G i', with G the change of lengths
@@ -24,14 +34,14 @@ def spring_lag_s(policy: Policy, pressure_kpa: np.ndarray) -> np.ndarray:
     moved on by them. Modes that chambers do not move have no lag.
 
     Args:
-        policy: the arm.
+        gains: numbers of the law.
+        springs: from pressures (2, n_chambers, n_chambers) [kPa] to lengths (2, n_chambers, n_springs) [m].
         pressure_kpa (n_chambers,) [kPa]: pressures, at which G is taken.
     """
-    gains, n = policy.gains, policy.spec.n_chambers
-    low, high = (np.broadcast_to(np.asarray(x, float), n) for x in gains[4:6])
+    low, high = (np.broadcast_to(np.asarray(x, float), len(pressure_kpa)) for x in gains[4:6])
     step_kpa = _STEP * (high - low)
     either = pressure_kpa + np.stack([1.0, -1.0])[:, None, None] * np.diag(step_kpa)
-    longer_m, shorter_m = expected_springs(policy.spring_model, either)
+    longer_m, shorter_m = springs(either)
     change = (longer_m - shorter_m).T / (2.0 * step_kpa)  # (n_springs, n_chambers) [m/kPa]
     if gains.allocation is not None:
         change = change @ gains.allocation.chamber_error
@@ -67,6 +77,16 @@ class ShapeLag(NamedTuple):
         return pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
 
 
+class WayRule(NamedTuple):
+    """Numbers by which `WayError` corrects the goal."""
+
+    reward: RewardConfig  # whose axes goals ask for
+    dt_s: float  # duration of a tick
+    lead_s: float  # time by which the goal is given ahead of its time
+    share_per_s: float  # share of the error that the correction takes up in a second
+    limit_mm: float  # largest correction of an axis
+
+
 class WayError(NamedTuple):
     """Memory of a tip's errors on the way of a moving goal, and the correction of the goal that they ask for.
 
@@ -77,17 +97,16 @@ class WayError(NamedTuple):
     goals: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] of each tick, from the one two ticks ago to the lead
     correction_mm: np.ndarray = np.zeros(3)  # of the goal now
 
-    def after(self, goal: np.ndarray, pose: np.ndarray, controller: Any) -> WayError:
+    def after(self, goal: np.ndarray, pose: np.ndarray, rule: WayRule) -> WayError:
         """Return the memory a tick later, for a goal ahead (6,) and a believed pose now (6,) [mm, deg]."""
-        config, policy = controller.config, controller.policy
-        goals = (*self.goals, goal)[-round(controller.lead_s / controller.dt_s) - 3 :]
-        if controller.dt_s * (len(goals) - 3) < controller.lead_s - 0.5 * controller.dt_s:
+        goals = (*self.goals, goal)[-round(rule.lead_s / rule.dt_s) - 3 :]
+        if rule.dt_s * (len(goals) - 3) < rule.lead_s - 0.5 * rule.dt_s:
             return WayError(goals)
         before, last, now = goals[:3]
         kept_mm = _turned(self.correction_mm, (last - before)[:3], (now - last)[:3])
-        error_mm = asked_error(pose, now, policy.reward)[:3]
-        correction_mm = kept_mm - config.way_share_per_s * controller.dt_s * error_mm
-        return WayError(goals, np.clip(correction_mm, -config.max_shift[0], config.max_shift[0]))
+        error_mm = asked_error(pose, now, rule.reward)[:3]
+        correction_mm = kept_mm - rule.share_per_s * rule.dt_s * error_mm
+        return WayError(goals, np.clip(correction_mm, -rule.limit_mm, rule.limit_mm))
 
     @property
     def correction(self) -> np.ndarray:

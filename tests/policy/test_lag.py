@@ -42,7 +42,7 @@ def test_an_error_that_stays_beside_a_round_way_is_made_up_for():
         late = corrected[-n_lead] if len(corrected) >= n_lead else np.zeros(6)  # the correction is in force
         outward, along, up = axes(k)
         off_mm = 3.0 * outward - 4.0 * along + 2.0 * up
-        way = way.after(ahead, now + np.append(off_mm, np.zeros(3)) + late, CONTROLLER)
+        way = way.after(ahead, now + np.append(off_mm, np.zeros(3)) + late, CONTROLLER.way_rule)
         corrected.append(way.correction)
     assert np.linalg.norm(off_mm + late[:3]) < 0.02 * np.linalg.norm(off_mm)
     assert not corrected[n_lead].any() and not way.correction[3:].any()

@@ -7,9 +7,11 @@ import pytest
 
 from calib.read.static_poses import find_static_poses, nearest_rotation
 from mjx_softarm import ArmSpec
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.session import trace
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from tests.linear_arm import CONTROLLER, SENSOR, LinearArm, go, read_m
+from tests.linear_arm import CONTROLLER, GOALS, POLICY, SENSOR, LinearArm, between, go, read_m
 
 SPEC = ArmSpec.default()
 
@@ -140,3 +142,34 @@ def test_a_log_of_the_loop_has_a_pose_at_each_arrival():
         run.log, readings=SENSOR.readings(read_m(run.log) + 1e-4 * run.log.row[:, None])
     )
     assert find_static_poses([waiting], SPEC)[0].n == 0
+
+
+def test_a_log_of_a_moving_goal_has_poses_at_its_stops_only():
+    """Between the stops the springs are still by the loop's rule, as the goal moves slowly."""
+    slow = np.linspace(GOALS[0], GOALS[1], 3)
+    run = trace(LinearArm(), Controller.of(POLICY, between), slow, pace_s=20.0)
+    assert run.ways and len(run.log) > 1500
+    poses, row_uses = find_static_poses([run.log], SPEC)
+    assert poses.n == len(run.arrivals) == 2 and sum(row_uses.values()) == len(run.log)
+    for k, arrival in enumerate(run.arrivals):
+        at_m = read_m(run.log)[arrival.row + 1 - CONTROLLER.window : arrival.row + 1].mean(axis=0)
+        np.testing.assert_allclose(poses.with_lengths(SPEC).spring_m[k], at_m, atol=1e-4)
+
+
+def test_equal_goals_in_a_row_give_one_pose():
+    run = go(LinearArm(), goals=[GOALS[0], GOALS[0], GOALS[1]])
+    assert len(run.arrivals) == 3 and find_static_poses([run.log], SPEC)[0].n == 2
+
+
+def test_springs_under_a_slow_law_are_watched_for_longer_and_those_near_the_axis_more_closely():
+    """As the loop itself watches them."""
+    log = go(LinearArm(), goals=[GOALS[0]]).log
+    log = log.take(np.append(np.arange(len(log)), np.full(1000, len(log) - 1)))  # it stands there
+    slow = SPEC.replace(control={"ki_kpa_per_ms": 0.1 * SPEC.control.ki_kpa_per_ms})
+    (at_once,), (later,) = (find_static_poses([log], spec)[0].n_rows for spec in (SPEC, slow))
+    assert at_once == CONTROLLER.window and later > 2 * CONTROLLER.window
+    creeping = read_m(log) + 1e-5 * np.arange(len(log))[:, None]  # halves of a window are 0.12 mm apart
+    creep = dataclasses.replace(log, readings=SENSOR.readings(creeping))
+    radius_m = 0.25 * np.mean(SPEC.geometry.spring_radius_m)
+    slim = SPEC.replace(geometry={"spring_radius_m": float(radius_m)})
+    assert [find_static_poses([creep], spec)[0].n for spec in (SPEC, slim)] == [1, 0]
