@@ -79,24 +79,28 @@ Part = tuple[np.ndarray, np.ndarray, np.ndarray]  # l [m]; tip less even(l), res
 
 def _parts(log: Log, spec: ArmSpec) -> list[Part]:
     """Return the parts of a log without gaps, one row each `EVERY_S`."""
-    readings = log.readings_of(spec.sensor)
-    if log.tip_m is None or (readings is None and log.spring_m is None):
+    # Spring lengths, and the mounting
+    readings, spring_m, tip_m = log.readings_of(spec.sensor), log.spring_m, log.tip_m
+    if readings is not None:
+        spring_m = spec.spring_sensor.lengths(readings, np.nan).length_m
+    if tip_m is None or spring_m is None:
         return []
-    spring_m = log.spring_m if readings is None else spec.spring_sensor.lengths(readings, np.nan).length_m
-    mount, site_m = ArmParams.from_spec(spec).mount, np.asarray(ArmParams.from_spec(spec).spring_site_m)
-    base = Frame(np.asarray(mount.base_position_m), np.asarray(mount.base_rotation))
-    cuts = np.flatnonzero(np.diff(log.time_s) > MAX_STEP_S) + 1
-    found = []
-    for rows in np.split(np.arange(len(log)), cuts):
-        grid = np.arange(log.time_s[rows[0]], log.time_s[rows[-1]], EVERY_S)
-        rows = rows[np.searchsorted(log.time_s[rows], grid + 1e-6, side="right") - 1]
-        rows = rows[np.isfinite(spring_m[rows]).all(axis=1) & np.isfinite(log.tip_m[rows]).all(axis=1)]
+    params = ArmParams.from_spec(spec)
+    base = Frame(np.asarray(params.mount.base_position_m), np.asarray(params.mount.base_rotation))
+
+    # Rows at regular times of each part, simulated at rest
+    found, time_s = [], log.time_s
+    cuts = np.flatnonzero(np.diff(time_s) > MAX_STEP_S) + 1
+    for part in np.split(np.arange(len(log)), cuts):
+        grid = np.arange(float(time_s[part[0]]), float(time_s[part[-1]]), EVERY_S)
+        rows = part[np.searchsorted(time_s[part], grid + 1e-6, side="right") - 1]
+        rows = rows[np.isfinite(spring_m[rows]).all(axis=1) & np.isfinite(tip_m[rows]).all(axis=1)]
         if len(rows) * EVERY_S < MIN_S:
             continue
-        at_rest, even = simulate_poses(spec, spring_m[rows]), even_pose(base, site_m, spring_m[rows])
+        length_m, at_rest = spring_m[rows], simulate_poses(spec, spring_m[rows])
         if at_rest.valid.all():
-            tip_mm = 1e3 * log.tip_m[rows]
-            found.append((spring_m[rows], tip_mm - even[:, :3], at_rest.pose[:, :3] - even[:, :3]))
+            even_mm = even_pose(base, np.asarray(params.spring_site_m), length_m)[:, :3]
+            found.append((length_m, 1e3 * tip_m[rows] - even_mm, at_rest.pose[:, :3] - even_mm))
     return found
 
 
