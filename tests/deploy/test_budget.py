@@ -9,7 +9,7 @@ import pytest
 
 from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.accuracy.budget import budget
-from mjx_softarm.deploy.accuracy.measure import figures, measure
+from mjx_softarm.deploy.accuracy.measure import figures, measure, write_accuracy
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.logs.files import read_matrix
@@ -121,6 +121,24 @@ def test_an_arm_that_the_policy_does_not_know():
     found = split(Planted(off_mm=np.array([3.0, 0.0, 4.0]), policy=POLICY), policy=POLICY)
     assert found.largest == "rest" and found.parts_mm["rest"] == pytest.approx(5.0, abs=0.4)
     assert not found.calibrated and "calibrate it and train" in found.lines()[1]
+
+
+def test_a_reading_that_was_lost_on_arrival_does_not_count(tmp_path):
+    controller = Controller.of(KNOWN, nearest_springs)
+    run = go(Planted(shift_m=SHIFT_M), goals=GOALS_OF_CIRCLE, controller=controller)
+    whole = budget(run, controller, 0.0)
+    # One row of a window, then all rows of another
+    rows = [
+        run.arrivals[0].row - 3,
+        *range(run.arrivals[1].row + 1 - controller.window, run.arrivals[1].row + 1),
+    ]
+    run.log.readings[rows, 4] = np.nan
+    found = budget(run, controller, 0.0)
+    assert found.parts_mm["springs"] == pytest.approx(whole.parts_mm["springs"], rel=0.15)
+    assert np.isfinite([*found.parts_mm.values(), found.off_mm, *found.shift_mm]).all()
+    accuracy = measure(run, controller, GOALS_OF_CIRCLE)
+    told = figures(accuracy, run.counts()) | {"budget": found.figures()}
+    write_accuracy(tmp_path, accuracy, told)
 
 
 def test_measure_tells_the_parts_and_logs_the_payload(tmp_path, monkeypatch, capsys):

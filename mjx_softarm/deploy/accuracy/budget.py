@@ -97,10 +97,10 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float) -> Budget | 
         controller: its policy.
         payload_kg: payload that hung at the gripper.
     """
-    # The goals, and the arm at rest there, where motion capture saw it
+    # The goals, and the arm at rest there, where motion capture saw it and the springs were read
     policy = controller.policy
     both = [(arrival.goal, at_rest(run, controller, arrival)) for arrival in run.arrivals]
-    both = [(goal, rest) for goal, rest in both if np.isfinite(rest.error).all()]
+    both = [(goal, rest) for goal, rest in both if np.isfinite([*rest.error, *rest.spring_m]).all()]
     if not both:
         return None
     goal, seen = np.array([goal for goal, _ in both]), np.array([rest.error for _, rest in both])  # (p, 6)

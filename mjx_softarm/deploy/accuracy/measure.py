@@ -138,7 +138,7 @@ class Rest(NamedTuple):
     """Arm at rest on arrival at a goal: means over the window that ends with it."""
 
     error: np.ndarray  # (6,) [mm, deg] of the tip by motion capture, NaN where it was not seen
-    spring_m: np.ndarray  # (n_springs,) lengths read
+    spring_m: np.ndarray  # (n_springs,) lengths read, NaN where none was
     reference_m: np.ndarray  # (n_springs,)
     load_kg: float  # believed payload
     saturated: np.ndarray  # (n_chambers,) bool
@@ -156,9 +156,9 @@ def at_rest(run: LoopRun, controller: Controller, arrival: Arrival) -> Rest:
     assert log.pressure_kpa is not None and log.reference_m is not None
     assert log.readings is not None and log.load_kg is not None
     rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
-    spring_m = policy.sensor.lengths(log.readings[rows], np.nan).length_m.mean(axis=0)
+    spring_m = _finite_mean(policy.sensor.lengths(log.readings[rows], np.nan).length_m)
     reference_m, law = log.reference_m[arrival.row], policy.gains.measured()
-    mean_kpa = log.pressure_kpa[rows].mean(axis=0)
+    mean_kpa = _finite_mean(log.pressure_kpa[rows])
     return Rest(
         seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal),
         spring_m,
@@ -166,6 +166,12 @@ def at_rest(run: LoopRun, controller: Controller, arrival: Arrival) -> Rest:
         float(log.load_kg[arrival.row]),
         saturated(mean_kpa, reference_m, spring_m, law, policy.tolerance_m),
     )
+
+
+def _finite_mean(values: np.ndarray) -> np.ndarray:
+    """Return the means (n,) of the rows of values (k, n) that are finite; NaN if none is."""
+    rows = values[np.isfinite(values).all(axis=1)]
+    return rows.mean(axis=0) if len(rows) else np.full(values.shape[1], np.nan)
 
 
 def figures(
