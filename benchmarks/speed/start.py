@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,13 +68,13 @@ def work(preset: str, began: float) -> None:
     # Listen to the compiler.
     import jax
 
-    seconds: Counter[str] = Counter()
+    seconds: defaultdict[str, float] = defaultdict(float)
 
-    def listen(event: str, duration: float, **facts: Any) -> None:
+    def listen(event: str, duration_secs: float, **facts: Any) -> None:
         stage = STAGES.get(event.rsplit("/", 1)[-1].removesuffix("_duration"))
-        name = facts.get("fun_name", "").removeprefix("jit(").removesuffix(")")
+        name = str(facts.get("fun_name", "")).removeprefix("jit(").removesuffix(")")
         if stage:
-            seconds[f"{PROGRAMS.get(name, 'others')}: {stage}"] += duration
+            seconds[f"{PROGRAMS.get(name, 'others')}: {stage}"] += duration_secs
 
     jax.monitoring.register_event_duration_secs_listener(listen)
 

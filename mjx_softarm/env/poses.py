@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +38,8 @@ class PosePool:
             ContextVar[Pool | None]("pool", default=None),
         )
         sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
-        self.shapes = Pool(*(jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes))
+        shapes: Any = (jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes)
+        self.shapes = Pool(*shapes)  # in the places of arrays
 
     def __call__(self) -> Pool:
         """Return the poses."""

@@ -38,7 +38,7 @@ class Iterate(NamedTuple):
     convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
     iteration: Array  # (*arms,) int
 
-    def goes_on(self, n_small: Array) -> Array:
+    def goes_on(self, n_small: Array | int) -> Array:
         """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
         return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
