@@ -25,9 +25,8 @@ from benchmarks.harness.common import grouped
 from benchmarks.paper.gradient_descent import gradient_descent
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli, xla
-from mjx_softarm._support.lazy import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
-from mjx_softarm.env.state import PAYLOAD_SHARE
+from mjx_softarm.env.state import PAYLOAD_SHARE, State
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle_pressures
