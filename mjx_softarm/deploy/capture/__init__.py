@@ -12,8 +12,9 @@ system's axes then, and put their origins in the middle of the last plate and of
 the few millimetres and degrees that remain.
 
 The loop takes the newest frame of each tick and never waits for one. A frame is missed, which is a gap in the
-log, where none is new, it is late, or a body is not seen in it. The base does not move, so it keeps the place
-at which it was last seen. Frames are logged with the tick that takes them, not shifted by their latency.
+log, where none is new, it is late, it is the first after a second without any, or a body is not seen in it.
+The base does not move, so it keeps the place at which it was last seen. Frames are logged with the tick that
+takes them, not shifted by their latency.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from mjx_softarm.deploy.accuracy.measure import LOOK_S, LOOKS
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.capture.natnet import NatNet
 from mjx_softarm.deploy.capture.qualisys import Qualisys
-from mjx_softarm.deploy.capture.system import UP, CaptureName, Source
+from mjx_softarm.deploy.capture.system import UP, CaptureName, Frame, Source
 from mjx_softarm.deploy.link import describe
 from mjx_softarm.posture import straight_pose
 from mjx_softarm.sensing.pose import (
@@ -43,6 +44,7 @@ from mjx_softarm.spec import ArmSpec
 LATE_S = 0.05  # delay, beyond that of the fastest frames, of a frame that is late; by hand
 DRIFT = 1e-3  # largest difference of the two clocks' rates that is not taken for a delay; by hand
 LOST_S = 1.0  # time without a frame after which motion capture counts as lost; by hand
+MOST_POLLS = 50  # polls that pass over queued frames; they read more than a socket holds; by hand
 # Largest distance of the tip from the end of the straight arm, in its lengths, and largest angle; by hand.
 # Wrong axes are 1.4 lengths and 90 degrees off.
 _NEAR, _TURNED_DEG = 0.5, 60.0
@@ -78,6 +80,7 @@ class CapturedArm:
     def __init__(self, arm: Any, source: Source, name: CaptureName, tell: Callable[[str], None]):
         self._arm, self._source, self._name, self._tell = arm, source, name, tell
         self._delay, self._seen_s, self._lost = Delay(), time.monotonic(), False
+        self._polled_s = -np.inf  # time of the last frame, whatever it shows
         self._base: tuple[np.ndarray, np.ndarray] | None = None if name.base else (np.zeros(3), np.eye(3))
         self._n_asked, self._latency_s, self._delay_s = 0, [], []
 
@@ -93,7 +96,7 @@ class CapturedArm:
         self._n_asked += 1
         now_s = time.monotonic()
         try:
-            seen = self._take(now_s)
+            seen = self._take()
         except OSError as error:
             if now_s - self._seen_s > LOST_S and not self._lost:
                 self._lost = True
@@ -114,13 +117,27 @@ class CapturedArm:
         sent = f"frames were sent {1e3 * known.mean():.1f} ms after the exposure, " if len(known) else ""
         return f"{line}; {sent}at most {1e3 * max(self._delay_s):.0f} ms later than the fastest"
 
-    def _take(self, now_s: float) -> Capture:
-        name = self._name
-        frame = self._source.poll()
+    def _newest(self) -> Frame | None:
+        """Return the newest frame since the last call; None without one, or if it may be an old one."""
+        frame, now_s = self._source.poll(), time.monotonic()
+        if frame is None:
+            return None
+        paused, self._polled_s = now_s - self._polled_s > LOST_S, now_s
+        if not paused:
+            return frame
+        # Frames have queued up, maybe until the queue was full: all may be old. The next one is new.
+        for _ in range(MOST_POLLS):
+            if self._source.poll() is None:
+                break
+        return None
+
+    def _take(self) -> Capture:
+        name, frame = self._name, self._newest()
         if frame is None:
             raise TimeoutError(f"got no new frame from {name.host}")
-        delay_s = self._delay.of(frame.time_s, now_s)
-        self._base = frame.bodies.get(name.base, self._base)
+        delay_s = self._delay.of(frame.time_s, time.monotonic())
+        if name.base:
+            self._base = frame.bodies.get(name.base, self._base)
         if delay_s > LATE_S:
             raise TimeoutError(f"got a frame {1e3 * delay_s:.0f} ms late, expected {1e3 * LATE_S:g} at most")
         if self._base is None or name.body not in frame.bodies:

@@ -44,8 +44,9 @@ class NatNet:
         with needing("capture", "--capture"):
             self._package = importlib.import_module("natnet")
         self._name = name
+        self._host = socket.gethostbyname(name.host)  # looked up once: the package sends at each poll
         self._new: list[Any] = []  # frames that have come since the last poll
-        self._described: Any = None
+        self._described: Any = None  # None while the server is asked, and its bodies' numbers are not known
         self._first: Any = None  # the first frame's end, for the rate of the server's clock
         self._asked_s = time.monotonic()
         for multicast in (False, True):
@@ -57,39 +58,38 @@ class NatNet:
             what = "no frame" if self._described else "no description of its bodies"
             raise TimeoutError(f"got {what} from {name.host}, expected Motive to stream")
 
-        # Bodies by their number in frames, as the server describes them
+        # Bodies and markers, as the server describes them
         described, where = self._described, f"--capture natnet:{name.host}"
-        self._bodies = {body.id_num: body.name for body in described.rigid_bodies}
         sets = {found.name: len(found.marker_names) for found in described.marker_sets}
         for body in (name.body, name.base):
-            check_names(where, "body", body, sorted(self._bodies.values()))
+            check_names(where, "body", body, sorted(found.name for found in described.rigid_bodies))
         check_names(where, "marker set", name.markers, sorted(sets))
         self._n_markers = sets.get(name.markers, 0)
 
     def poll(self) -> Frame | None:
         """Return the newest frame since the last call, None without one, at once; see `Source`."""
         self._read()
-        now_s = time.monotonic()
-        if self._new:
-            frame, self._asked_s = self._new[-1], now_s
-            self._new.clear()
-            return self._frame(frame)
+        frame, now_s = self._new[-1] if self._new else None, time.monotonic()
+        self._new.clear()
+        # After a while without a frame the server may have begun anew, and its bodies have other numbers.
         if now_s - self._asked_s > AGAIN_S:
+            self._asked_s, self._described, self._first = now_s, None, None
             self._client.send_request(self._client.NAT_CONNECT)
-            self._asked_s = now_s
-        return None
+            self._client.request_modeldef()
+        if frame is None or self._described is None:
+            return None
+        self._asked_s = now_s
+        return self._frame(frame)
 
     def close(self) -> None:
         self._client.shutdown()
 
     def _connect(self, multicast: bool) -> Any:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect(
-                (self._name.host, COMMAND_PORT)
-            )  # sends nothing; tells which of our addresses it is
+            probe.connect((self._host, COMMAND_PORT))  # sends nothing; tells which of our addresses it is
             local = probe.getsockname()[0]
         client = self._package.NatNetClient(
-            self._name.host, local, command_port=COMMAND_PORT, data_port=DATA_PORT, use_multicast=multicast
+            self._host, local, command_port=COMMAND_PORT, data_port=DATA_PORT, use_multicast=multicast
         )
         client.on_data_frame_received_event.handlers.append(self._on_frame)
         client.on_data_description_received_event.handlers.append(self._on_descriptions)
@@ -133,13 +133,14 @@ class NatNet:
         self._described = described
 
     def _frame(self, frame: Any) -> Frame:
+        names = {body.id_num: body.name for body in self._described.rigid_bodies}
         bodies = {
-            self._bodies.get(body.id_num, ""): (
+            names[body.id_num]: (
                 np.array(body.pos),
                 np.asarray(rotation_from_quaternion(np.roll(body.rot, 1))),
             )
             for body in frame.rigid_bodies
-            if body.tracking_valid is not False  # None before NatNet 2.6
+            if body.id_num in names and body.tracking_valid is not False  # None before NatNet 2.6
         }
         marker_m = np.full((self._n_markers, 3), np.nan)
         for found in frame.marker_sets:

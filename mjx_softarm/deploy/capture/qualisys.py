@@ -7,10 +7,13 @@ tell how old a frame is when it is sent.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import importlib
 import logging
 import math
+import socket
 import xml.etree.ElementTree
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,7 @@ from mjx_softarm._support.errors import needing
 from mjx_softarm.deploy.capture.system import CaptureName, Frame, check_names, numbered
 
 PORT = 22223  # of the protocol with little-endian numbers
+VERSION = "1.25"  # of the protocol
 WAIT_S = 3.0  # longest wait for QTM's answers
 AGAIN_S = 2.0  # time between two tries to reach a server that has gone
 
@@ -33,9 +37,11 @@ class Qualisys:
 
     def __init__(self, name: CaptureName):
         with needing("capture", "--capture"):
-            self._package = importlib.import_module("qtm_rt")
+            self._package = importlib.import_module("qtm_rt.qrt")
         logging.getLogger("qtm_rt").addHandler(logging.NullHandler())  # this class tells its errors
         self._name = name
+        self._host = socket.gethostbyname(name.host)  # looked up once, not in the loop
+        self._error: Exception | None = None  # of the last try to connect again
         self._connection: Any = None
         self._packet: Any = None  # the newest that has not been taken
         self._loop = asyncio.new_event_loop()
@@ -53,7 +59,8 @@ class Qualisys:
             self._task = self._loop.create_task(self._again())
         self._loop.run_until_complete(asyncio.sleep(0))
         if not self._connected():
-            raise ConnectionResetError(f"got an end of the connection by {self._name.host}")
+            why = f"; the last try to connect again: {self._error}" if self._error else ""
+            raise ConnectionResetError(f"got an end of the connection by {self._name.host}{why}")
         packet, self._packet = self._packet, None
         return self._frame(packet) if packet is not None else None
 
@@ -62,6 +69,7 @@ class Qualisys:
             return
         if self._task is not None:
             self._task.cancel()
+            self._loop.run_until_complete(asyncio.wait([self._task]))
         if self._connected():
             self._connection.disconnect()
         self._loop.run_until_complete(asyncio.sleep(0))
@@ -73,7 +81,9 @@ class Qualisys:
     async def _again(self) -> None:
         try:
             await self._connect()
-        except Exception:  # it is tried again, and `poll` tells that the server has gone
+            self._error = None
+        except Exception as error:  # it is tried again, and `poll` tells why
+            self._error = error
             await asyncio.sleep(AGAIN_S)
 
     async def _connect(self) -> None:
@@ -85,11 +95,32 @@ class Qualisys:
             raise TimeoutError(f"{got} within {WAIT_S:g} s") from error
 
     async def _begin(self) -> None:
-        """Connect, find the bodies and markers by name, and ask for frames."""
+        """Connect and ask for frames; close the connection if that fails."""
+        # Not the package's own `connect`, which leaves the connection open where QTM refuses the protocol
+        new_protocol = partial(self._package.QTMProtocol, loop=self._loop)
+        try:
+            transport, protocol = await self._loop.create_connection(new_protocol, self._host, PORT)
+        except OSError as error:
+            raise ConnectionError(f"got no connection to {self._name.host}:{PORT}: {error}") from error
+        self._packet = None  # one of an earlier connection may have its bodies in another order
+        with contextlib.ExitStack() as unless_done:
+            unless_done.callback(transport.abort)
+            try:
+                await protocol.set_version(VERSION)
+                connection = self._package.QRTConnection(protocol, WAIT_S)
+                await self._ask(connection)
+            except self._package.QRTCommandException as error:
+                raise ConnectionError(f"got the answer {error} from {self._name.host}:{PORT}") from error
+            self._connection = connection
+            unless_done.pop_all()
+
+    async def _ask(self, connection: Any) -> None:
+        """Find the bodies and markers by name, and ask for frames.
+
+        Raises:
+            InputError: QTM has no such body or no such markers.
+        """
         name, where = self._name, f"--capture qualisys:{self._name.host}"
-        connection = await self._package.connect(name.host, PORT)
-        if connection is None:
-            raise ConnectionError(f"got no connection to {name.host}:{PORT}, expected QTM there")
         settings = await connection.get_parameters(["6d", "3d"])
 
         # Places of bodies and markers in frames, by the order of QTM's settings
@@ -105,7 +136,6 @@ class Qualisys:
         # Frames
         components = ["6d", "3d"] if self._markers else ["6d"]
         await connection.stream_frames(components=components, on_packet=self._on_packet)
-        self._connection = connection
 
     def _on_packet(self, packet: Any) -> None:
         self._packet = packet

@@ -17,13 +17,14 @@ RATE_S = 0.005
 class Scene:
     """Bodies and markers in the axes of the system, and what is wrong at present.
 
-    `bodies`: name -> position (3,) [m] and axes (3, 3). `hidden`: names of lost bodies. `held`: frames are
-    made, but sent only once this is over. `mute`: no frames at all.
+    `bodies`: name -> position (3,) [m] and axes (3, 3). `hidden`: names of lost bodies. `unnamed`: bodies in
+    frames that the system does not describe. `held`: frames are made, but sent only once this is over.
+    `mute`: no frames at all.
     """
 
     def __init__(self, bodies, markers=()):
         self.bodies, self.markers = bodies, np.array(markers, float).reshape(-1, 3)
-        self.hidden, self.held, self.mute = set(), False, False
+        self.hidden, self.unnamed, self.held, self.mute = set(), set(), False, False
 
 
 class Server:
@@ -117,6 +118,8 @@ class NatNetServer(Server):
         names = b"".join(b"m%d\0" % k for k in range(len(self.scene.markers)))
         sets = [(0, b"arm\0" + struct.pack("<i", len(self.scene.markers)) + names)]
         for number, name in enumerate(self.scene.bodies, 7):
+            if name in self.scene.unnamed:
+                continue
             body = name.encode() + b"\0" + struct.pack("<ii3f", number, -1, 0.0, 0.0, 0.0)
             body += struct.pack("<i3fi", 1, 0.01, 0.0, 0.0, 0)  # one marker of its own, and its label
             sets.append((1, body + (b"m\0" if self.version >= (4, 0) else b"")))
@@ -156,6 +159,7 @@ class QualisysServer(Server):
         self.listener = socket.create_server(("127.0.0.1", port))
         self.listener.settimeout(0.01)
         self.port, self.client, self.streams = self.listener.getsockname()[1], None, False
+        self.n_accepted, self.n_dropped, self.refuses = 0, 0, ""
 
     def serve(self):
         with self.listener:
@@ -174,6 +178,7 @@ class QualisysServer(Server):
             self.client = self.listener.accept()[0]
         except TimeoutError:
             return
+        self.n_accepted += 1
         self.client.settimeout(1.0)
         self.send(1, b"QTM RT Interface connected\0")
 
@@ -189,7 +194,7 @@ class QualisysServer(Server):
 
     def drop(self):
         self.client.close()
-        self.client, self.streams = None, False
+        self.client, self.streams, self.n_dropped = None, False, self.n_dropped + 1
 
     def answer(self):
         self.client.setblocking(False)
@@ -209,7 +214,9 @@ class QualisysServer(Server):
             data = data[size:]
 
     def command(self, text):
-        if text.startswith("version"):
+        if self.refuses and text.startswith(self.refuses):
+            self.send(0, b"Parse error\0")
+        elif text.startswith("version"):
             self.send(1, b"Version set to " + text.split()[1].encode() + b"\0")
         elif text.startswith("getparameters"):
             bodies = "".join(f"<Body><Name>{name}</Name></Body>" for name in self.scene.bodies)

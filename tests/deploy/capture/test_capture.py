@@ -2,6 +2,7 @@
 
 import json
 import re
+import socket
 import time
 
 import numpy as np
@@ -85,12 +86,14 @@ def opened(request):
 
 def look(arm, tries=200):
     """Return the next frame that is not missed."""
+    seen = set()
     for _ in range(tries):
         try:
             return arm.motion_capture()
-        except OSError:
+        except OSError as error:
+            seen.add(str(error))
             time.sleep(0.005)
-    raise AssertionError("no frame came")
+    raise AssertionError(f"no frame came: {seen}")
 
 
 def missed(arm, message, tries=200):
@@ -199,10 +202,67 @@ def test_a_server_that_goes_does_not_hold_up_the_loop_and_may_come_back(system, 
         with pytest.raises(OSError):
             arm.motion_capture()
     assert time.monotonic() - begin_s < 100 * 0.02
-    again = serve(system, scene_of(), **({"port": server.port} if system == "qualisys" else {}))
+    scene = scene_of()
+    scene.bodies = dict(reversed(scene.bodies.items()))  # they have other numbers now
+    again = serve(system, scene, **({"port": server.port} if system == "qualisys" else {}))
     if system == "natnet":  # the same port is asked
         arm._source._client._NatNetClient__command_port = again.port
     np.testing.assert_allclose(1e3 * look(arm, 1000).tip_m, POSE[:3], atol=1e-2)
+
+
+def test_a_body_that_the_system_does_not_describe_is_no_base(serve, opened):
+    scene = scene_of(base=False)
+    scene.bodies["ghost"], scene.unnamed = (np.ones(3), np.eye(3)), {"ghost"}
+    serve("natnet", scene)
+    arm, _ = opened("natnet:127.0.0.1:tip,up=z")
+    for _ in range(5):
+        np.testing.assert_allclose(1e3 * look(arm).tip_m, POSE[:3], atol=1e-2)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_frames_that_queued_up_are_not_taken_for_new_ones(system, serve, opened, monkeypatch):
+    monkeypatch.setattr("mjx_softarm.deploy.capture.natnet.AGAIN_S", 100.0)
+    monkeypatch.setattr(capture, "LOST_S", 0.2)
+    scene = scene_of(base=False)
+    serve(system, scene)
+    arm, _ = opened(f"{system}:127.0.0.1:tip,up=z")
+    look(arm)
+    for _ in range(2):
+        time.sleep(0.5)  # 100 frames
+        place_m, axes = scene.bodies["tip"]
+        scene.bodies["tip"] = place_m + 0.01, axes
+        time.sleep(0.05)
+        np.testing.assert_allclose(look(arm).tip_m, place_m + 0.01, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [("bodies", "got no body 'tip', expected one of base"), ("version", "got the answer .*Parse error")],
+)
+def test_a_server_that_comes_back_wrong_is_told_why_and_asked_on(wrong, message, serve, opened, monkeypatch):
+    """The host is looked up once. A connection that is of no use is closed."""
+    monkeypatch.setattr("mjx_softarm.deploy.capture.qualisys.AGAIN_S", 0.05)
+    monkeypatch.setattr(capture, "LOST_S", 0.05)
+    server = serve("qualisys", scene_of())
+    arm, _ = opened("qualisys:localhost:tip,base=base,up=z")
+    look(arm)
+    server.__exit__()
+    asked = []
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *args, **_: asked.append(args))
+    again = QualisysServer(scene_of(), port=server.port)
+    bodies = again.scene.bodies
+    if wrong == "bodies":
+        again.scene.bodies = {"base": bodies["base"]}
+    else:
+        again.refuses = wrong
+    with again:
+        for n in (2, 4):
+            while again.n_dropped < n:
+                missed(arm, f"got an end of the connection by localhost.*{message}")
+        assert again.n_accepted - again.n_dropped <= 1
+        again.scene.bodies, again.refuses = bodies, ""
+        np.testing.assert_allclose(1e3 * look(arm, 1000).tip_m, POSE[:3], atol=1e-2)
+        assert not asked
 
 
 @pytest.mark.parametrize(

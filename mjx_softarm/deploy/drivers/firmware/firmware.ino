@@ -279,7 +279,7 @@ void setup() {
   Wire.begin();
   Wire.setClock(400000);
 #ifdef WIRE_HAS_TIMEOUT
-  Wire.setWireTimeout(1000, true);  // [us]; a converter that hangs does not hold up the valves
+  Wire.setWireTimeout(1000, true);  // [us]; a bus that hangs does not stop loop()
 #endif
   for (int k = 0; k < N_SPRINGS; ++k) {
     bool first = true;
