@@ -148,6 +148,10 @@ def _measure(
         raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
+    if seconds is not None and go_on:
+        raise InputError(
+            f"--go-on: got --seconds {seconds:g}, expected stops: a goal that moves does not wait"
+        )
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
     controller = _controller(policy)

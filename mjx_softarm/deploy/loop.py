@@ -168,10 +168,15 @@ def refusals(policy: Policy, goals: Sequence[np.ndarray]) -> dict[int, Event]:
     if not finite:
         return {}
     poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
-    found = {}
-    for k, pose, error in zip(finite, poses, errors, strict=True):
-        if not error <= policy.reward.threshold:  # nor NaN
-            got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
-            message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
-            found[k] = Event(Fault.GOAL_OUTSIDE, message)
-    return found
+    told = zip(finite, poses, errors, strict=True)
+    found = {k: refusal(policy, goals[k], pose, error) for k, pose, error in told}
+    return {k: event for k, event in found.items() if event}
+
+
+def refusal(policy: Policy, goal: np.ndarray, pose: np.ndarray, error: float) -> Event | None:
+    """Return the refusal of a goal (6,) whose nearest pose (6,) [mm, deg] has too large a weighted error."""
+    if error <= policy.reward.threshold:  # not for NaN
+        return None
+    got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goal, pose))
+    message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
+    return Event(Fault.GOAL_OUTSIDE, message)

@@ -56,8 +56,7 @@ def follow(
     goals = list(goals)
     refused = refusals(controller.policy, goals)  # before the arm moves: it takes longer than a tick
     source = ListedGoals(controller, goals, refused, duration_s, stay)
-    again = (lambda other: source.go_on(other, refusals(other.policy, goals))) if go_on else None
-    return _Session(arm, controller, source, tell, arrived, again=again).to_end(save)
+    return _Session(arm, controller, source, tell, arrived, go_on=go_on).to_end(save)
 
 
 def trace(
@@ -113,10 +112,10 @@ class _Session:
         arrived: Callable[[int], None] = lambda goal: None,
         look: Callable[[LoopState, Tick, dict[str, Any]], None] = lambda state, tick, row: None,
         kept: int | None = None,
-        again: Callable[[Controller], Event | None] | None = None,
+        go_on: bool = False,
     ):
         self.controller, self.goals = controller, goals
-        self.tell, self.arrived, self.look, self.again = tell, arrived, look, again
+        self.tell, self.arrived, self.look, self.may_go_on = tell, arrived, look, go_on
         self.state = start(controller)
         self.nothing = np.full(controller.policy.spec.n_springs, np.nan)
         self.link, self.rows = Link(arm, controller.policy.spec, controller.dt_s), Recorder(kept)
@@ -196,16 +195,14 @@ class _Session:
 
     def _goes_on(self, stop: Event) -> bool:
         """Go on without the chamber that was lost, if the run may and it is the first one."""
-        if self.again is None or stop.fault is not Fault.CHAMBER_LOST:
+        if not self.may_go_on or stop.fault is not Fault.CHAMBER_LOST:
             return False
+        assert isinstance(self.goals, ListedGoals)
         lost = lost_chambers(self.controller, self.state.watch, self.state.belief)
         self.tell(self._at(f"{stop.fault.value}: {stop.message} -> go on without {names('chamber', lost)}"))
-        self.controller = without(self.controller, lost)
-        refusal, self.again = self.again(self.controller), None
-        self.state = begun_again(self.controller, self.state)
-        if refusal:
-            self.state = self.state._replace(goal=None)
-            self._note((refusal,))
+        self.controller, search = without(self.controller, lost)
+        again = begun_again(self.controller, self.state)
+        self.state, self.may_go_on = self.goals.go_on(self.controller, search, again), False
         return True
 
     def _log(self, row: dict[str, Any]) -> None:

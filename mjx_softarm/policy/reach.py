@@ -24,7 +24,7 @@ from mjx_softarm.sensing.s2r import apply_correction, correction, inputs
 N_STARTS, N_STEPS = 4, 20
 _DIFFERENCE = 1e-3  # step of the finite differences, as a share of the range of pressures
 _EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after a step that did not
-_LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e3
+_LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e-3, 1e3
 _STAYING = 1e-4  # weight of a chamber that does not follow, beside the ones that do
 
 
@@ -37,21 +37,10 @@ def nearest_poses(policy: Policy, goal: np.ndarray) -> tuple[np.ndarray, np.ndar
     return nearest_of(policy, goal, search)
 
 
-def nearest_springs(policy: Policy, goal: np.ndarray) -> np.ndarray:
-    """Return the spring lengths (n_springs,) [m] of the pose nearest to a goal (6,) [mm, deg]."""
-    goal = np.asarray(goal, float)[None]
-    search, n = begin(policy, 1), policy.spec.n_chambers
-    for _ in range(N_STEPS):
-        search = improve(policy, goal, search)
-    share = search[:, :n]
-    off = np.sum((_at(policy, share) - _target(policy, goal, len(share))) ** 2, axis=-1)
-    return np.asarray(_springs(policy, share[np.argmin(off)]), float)
-
-
 def begin(policy: Policy, k: int) -> np.ndarray:
     """Return the start of a search for k goals (k * N_STARTS, n + 1): shares of the pressures, damping."""
     start = np.random.default_rng(0).uniform(0.2, 0.8, (N_STARTS, policy.spec.n_chambers))
-    return np.tile(np.concat([start, np.full((N_STARTS, 1), 1e-3)], axis=1), (k, 1))
+    return np.tile(np.concat([start, np.full((N_STARTS, 1), _FIRST_DAMPING)], axis=1), (k, 1))
 
 
 def improve(policy: Policy, goal: Array, search: Array) -> Array:
@@ -87,6 +76,19 @@ def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array
         best = xp.where(better[:, None], pose[:, start], best)
         least = xp.where(better, square[:, start], least)
     return best, xp.sqrt(xp.sum(scaled_error(best, goal, policy.reward) ** 2, axis=-1))
+
+
+def best_of(policy: Policy, goal: np.ndarray, search: np.ndarray) -> np.ndarray:
+    """Return the best row (1, n + 1) of a search for one goal (1, 6) [mm, deg], to go on from."""
+    share = search[:, : policy.spec.n_chambers]
+    off = np.sum((_at(policy, share) - _target(policy, goal, len(share))) ** 2, axis=-1)
+    # Steps that no longer helped have raised the damping.
+    return np.append(share[np.argmin(off)], _FIRST_DAMPING)[None]
+
+
+def springs_of(policy: Policy, search: np.ndarray) -> np.ndarray:
+    """Return the spring lengths (rows, n_springs) [m] of the rows of a search."""
+    return np.asarray(_springs(policy, search[:, : policy.spec.n_chambers]), float)
 
 
 def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
