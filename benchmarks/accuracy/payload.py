@@ -10,6 +10,8 @@ section; or this process with some poses of a known payload besides.
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,9 +23,11 @@ from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.leastsquares import ridge
 from calib.fit.payload import fit_payloads, told_payload
 from calib.fit.s2r import simulate_poses
+from calib.read.logs import read_log
 from calib.read.measurements import measure as measurements_of
 from calib.run import calibrate
 from mjx_softarm._support import cli, xla
+from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mechanics.excitation import circle_poses, random_pressures
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.policy.runtime import PolicyRunner, tip_pose
@@ -39,17 +43,22 @@ N_READINGS = 25  # averaged: half a second
 CLOSE_M, MOST_KPA, N_STEPS = 2e-4, 15.0, 25  # of the search for pressures that hold springs
 
 
-def measure(rods: cli.Integers = (0, 1, 2), poses: int = 500, points: int = 40) -> dict[str, Any]:
+def measure(
+    rods: cli.Integers = (0, 1, 2), poses: int = 500, points: int = 40, keep: cli.MaybePath = None
+) -> dict[str, Any]:
     """How well is the payload of an arm of other physics told, and does its interval hold it?
 
     Args:
         rods: seeds of the rod twins
         poses: number of random poses of each calibration
         points: of the circle
+        keep: folder for logs and calibrated arms, to go on with later; without one they are deleted
     """
     xla.enable_compilation_cache()
     springs_m = circle_springs(points)
-    rows = [row for seed in rods for row in _figures(seed, poses, springs_m)]
+    with tempfile.TemporaryDirectory() as folder:
+        home = keep or Path(folder)
+        rows = [row for seed in rods for row in _figures(seed, poses, springs_m, home)]
     return {"targets": targets(rows), "rods": rows}
 
 
@@ -78,12 +87,18 @@ def circle_springs(n: int) -> np.ndarray:
     return np.array(found)
 
 
-def _figures(seed: int, n_poses: int, springs_m: np.ndarray) -> list[dict[str, Any]]:
+def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list[dict[str, Any]]:
     # Record and calibrate the rod.
     spec = ArmSpec.default()
     arm = RodTwin(seed, spec, session=S2R_SESSION)
-    logs = [log_at_rest(arm, random_pressures(spec, n_poses, seed))]
-    spec = calibrate(logs, spec, steps={"springs": steps.springs, "chambers": steps.chambers}).spec
+    log, file = home / f"rod{seed}-{n_poses}.npz", home / f"rod{seed}-{n_poses}.toml"
+    if not log.exists():
+        write_log(log, log_at_rest(arm, random_pressures(spec, n_poses, seed)))
+    logs = [read_log(log, spec)[0]]
+    if not file.exists():
+        only = {"springs": steps.springs, "chambers": steps.chambers}
+        calibrate(logs, spec, steps=only).spec.to_toml(file)
+    spec = ArmSpec.from_toml(file)
     poses = measurements_of(logs, spec).poses.with_lengths(spec)
     found = simulate_poses(spec, poses.spring_m)
     columns = found.spring_m, poses.pressure_kpa, found.pressure_kpa

@@ -57,11 +57,13 @@ def _compare(seed: int, poses: int, first: int, tests: int) -> dict[str, Any]:
     logs = [log_at_rest(arm, pressure_kpa[:first])]
     known = calibrate(logs, spec)
     assert known.recorded is not None  # as there are poses
-    logs.append(log_at_rest(arm, plan(known.spec, known.recorded, poses - first, seed).pressure_kpa))
+    logs.append(
+        log_at_rest(arm, plan(known.spec, known.recorded, poses - first, seed, known.held).pressure_kpa)
+    )
     return {"random": random, "planned": _figures(calibrate(logs, spec), judge)}
 
 
-def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
+def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray, payload_kg: float = 0.0) -> Log:
     """Return a log of an arm at rest at pressures (n, n_chambers), each row the mean of a second."""
     rows: list[dict[str, np.ndarray]] = []
     for pressure in pressure_kpa:
@@ -81,9 +83,8 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
         )
     n = len(pressure_kpa)
     columns: Any = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    return Log(
-        source="rod", row=np.arange(n) + 2, time_s=5.0 * np.arange(n), payload_kg=np.zeros(n), **columns
-    )
+    kg = np.full(n, payload_kg)
+    return Log(source="rod", row=np.arange(n) + 2, time_s=5.0 * np.arange(n), payload_kg=kg, **columns)
 
 
 def _figures(calibration: Calibration, judge: Log) -> dict[str, Any]:
