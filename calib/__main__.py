@@ -111,11 +111,14 @@ def _run(
     refuse_existing(out)
     if since and spec:
         raise InputError(f"--spec: got {spec} and --since {since}, which has its own, expected one")
+    how = {"shared": shared_springs, "fit_compensation": fit_compensation}
+    if since and any(how.values()):
+        option = "--shared-springs" if shared_springs else "--fit-compensation"
+        raise InputError(f"{option}: got --since {since}, whose springs' lines stay, expected one of them")
     known = load_calibration(since) if since else None
     arm = known.spec if known else ArmSpec.of(spec)
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
-    how = {"shared": shared_springs, "fit_compensation": fit_compensation}
     steps = {**STEPS, "springs": functools.partial(springs, **how)}
     tell = functools.partial(print, flush=True)
     calibration = go_on(known, read, seed, tell) if known else calibrate(read, arm, seed, steps, tell)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.accuracy.arms import accuracy_of, run_command
-from benchmarks.harness.common import target
+from benchmarks.harness.common import target, three_of
 from mjx_softarm._support.errors import InputError
 
 WITHIN = 1.3  # target: error on the circle once back, over the error before the change
@@ -26,7 +26,7 @@ def measure(arms: tuple[str, ...], points: int = 16) -> dict[str, Any]:
         points: of the circle
 
     Raises:
-        InputError: there are no arms, or a command failed.
+        InputError: there are no arms, one has another form, or a command failed.
     """
     if not arms:
         raise InputError("--arms: got none, expected ARM=RUN=CALIBRATION of each")
@@ -37,7 +37,7 @@ def measure(arms: tuple[str, ...], points: int = 16) -> dict[str, Any]:
 
 def _measure(folder: Path, text: str, points: int) -> dict[str, Any]:
     """Measure an arm, the aged arm, and the aged arm once its calibration has gone on."""
-    arm, run, calibration = text.split("=")
+    arm, run, calibration = three_of(text, "--arms", "ARM=RUN=CALIBRATION")
     folder.mkdir()
     policy, later, renewed = Path(run) / "policy.npz", folder / "later", folder / "renewed.npz"
     circle = "--points", points

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from benchmarks.accuracy.path import means_over
+from benchmarks.harness.common import three_of
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.accuracy.measure import figures, read_goals
 from mjx_softarm.deploy.accuracy.measure import measure as accuracy
@@ -25,13 +26,13 @@ def measure(policies: tuple[str, ...], points: int = 16) -> dict[str, Any]:
         points: of the circle
 
     Raises:
-        InputError: there are no policies, or a goal was not measured.
+        InputError: there are no policies, one has another form, or a goal was not measured.
     """
     if not policies:
         raise InputError("--policies: got none, expected NAME=ARM=FILE of each")
     rows = []
     for text in policies:
-        name, arm, file = text.split("=")
+        name, arm, file = three_of(text, "--policies", "NAME=ARM=FILE")
         policy = load_policy(file)
         goals, row = read_goals("circle", policy, points), {"policy": name, "arm": arm}
         for case, config in CASES.items():

@@ -22,6 +22,7 @@ from rich.text import Text
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from train.epoch.devices import mesh_of
 
@@ -45,6 +46,18 @@ def cpu_kind() -> str:
 def machine_kind() -> str:
     """Return the name of the GPU if JAX runs on one, else `cpu_kind`."""
     return jax.devices()[0].device_kind if jax.default_backend() == "gpu" else cpu_kind()
+
+
+def three_of(text: str, option: str, form: str) -> tuple[str, str, str]:
+    """Return the parts of an option's text of a form such as NAME=ARM=FILE.
+
+    Raises:
+        InputError: the text has another form.
+    """
+    parts = text.split("=")
+    if len(parts) != 3 or not all(parts):
+        raise InputError(f"{option}: got {text}, expected {form}")
+    return parts[0], parts[1], parts[2]
 
 
 def mesh_of_cores(n_arms: int) -> Mesh | None:

@@ -102,8 +102,15 @@ def test_a_calibration_goes_on_with_a_later_log(demo, calibrated, tmp_path, caps
     np.testing.assert_allclose(found_m, shift_m, atol=7e-4)
     assert (out / "s2r.npz").read_bytes() == (before / "s2r.npz").read_bytes()
     assert sorted(p.name for p in out.iterdir()) == sorted(p.name for p in before.iterdir())
-    both = ["run", str(later), "--since", str(before), "--spec", "paper", "--out", str(tmp_path / "other")]
-    assert main(both) == 2 and "--spec: got paper and --since" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--spec", "--shared-springs", "--fit-compensation"])
+def test_options_that_a_later_log_does_not_have_are_refused(option, tmp_path, capsys):
+    value = ["paper"] if option == "--spec" else []
+    words = ["run", "later.npz", "--since", "before", option, *value, "--out", str(tmp_path / "other")]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {option}: got ") and "--since before" in said and "expected one" in said
 
 
 def test_nothing_is_overwritten(demo, calibrated, capsys, tmp_path, monkeypatch):

@@ -212,7 +212,7 @@ def export(
         if calibration:
             options = ArmOptions(calibration=calibration)
             later = renewed(run, *options.read_arm(console))
-            enough &= told_enough(run, later, console)
+            enough &= told_enough(run, later, calibration, console)
             run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
             held = options.read_pressures(run.spec)
         policy = export_run(run, arm_model(run.spec, run.s2r, keeps, console.print, held), file)

@@ -1,11 +1,15 @@
 """Benchmarks of changed arms and of the loop's correction."""
 
+import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from benchmarks.accuracy import changes, correction
 from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy import session
+from mjx_softarm.deploy.accuracy.measure import figures, measure
 from mjx_softarm.policy.file import SHIPPED
 
 MM = {"first": 0.8, "aged": 7.0, "back": 1.0}
@@ -47,9 +51,38 @@ def test_an_arm_is_back_by_the_commands_of_a_user(status, verdict, monkeypatch):
         changes.measure(())
 
 
-def test_the_correction_changes_what_a_policy_reaches():
+def test_without_the_correction_a_policy_is_asked_for_the_goals_alone(monkeypatch):
+    runs = []
+
+    def watched(arm, controller, goals):
+        asked = []
+
+        def plan(pose, goal, *others):
+            asked.append(goal)
+            return controller.plan(pose, goal, *others)
+
+        run = session.follow(arm, dataclasses.replace(controller, plan=plan), goals)
+        shifted_mm = max(np.abs(goals - goal)[:, :3].max(axis=1).min() for goal in asked)
+        runs.append((shifted_mm, figures(measure(run, controller, goals), {})["translation_mm"]))
+        return run
+
+    monkeypatch.setattr(correction, "follow", watched)
     found = correction.measure((f"shipped=twin:0={SHIPPED}",), points=2)
-    [row], [mean] = found["policies"], found["means"]
-    assert row["with [mm]"] != row["without [mm]"] and mean["with [mm]"] == row["with [mm]"]
+    [row], [mean], ((shifted_mm, with_mm), (unshifted_mm, without_mm)) = (
+        found["policies"],
+        found["means"],
+        runs,
+    )
+    assert unshifted_mm == 0.0 and shifted_mm > 1.0
+    assert row["with [mm]"] == mean["with [mm]"] == with_mm
+    assert row["without [mm]"] == mean["without [mm]"] == without_mm
     with pytest.raises(InputError, match="--policies: got none, expected NAME=ARM=FILE"):
         correction.measure(())
+
+
+@pytest.mark.parametrize("text", ["twin:0", "twin:0=run", "a=b=c=d", "a==c"])
+def test_texts_of_another_form_are_refused(text):
+    with pytest.raises(InputError, match=f"--arms: got {text}, expected ARM=RUN=CALIBRATION"):
+        changes.measure((text,))
+    with pytest.raises(InputError, match=f"--policies: got {text}, expected NAME=ARM=FILE"):
+        correction.measure((text,))

@@ -1,5 +1,7 @@
 """A run on a later calibration of its arm."""
 
+import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -7,6 +9,7 @@ from rich.console import Console
 
 from mjx_softarm import ArmSpec
 from tests.train.small import CONFIG, SHORT
+from train.presets import PRESETS
 from train.runs.checkpoint import Run, RunError
 from train.runs.renew import renewed, told_enough
 
@@ -32,8 +35,10 @@ def test_training_is_needed_where_simulated_errors_grow(
         return SimpleNamespace(evaluate=lambda policy: (summary, None, None))
 
     monkeypatch.setattr("train.runs.run.task_of_run", task_of)
-    then, now = (SimpleNamespace(path=path, policy=lambda: None) for path in figures)
-    assert told_enough(then, now, Console()) == enough
+    config = dataclasses.replace(PRESETS["payload"], seed=3)
+    then, now = (SimpleNamespace(path=path, config=config, policy=lambda: None) for path in figures)
+    assert told_enough(then, now, Path("new"), Console()) == enough
     said = " ".join(capsys.readouterr().out.split())
     assert f"median tip error 1.00 mm on the arm of the training, {median_mm:.2f} mm on the later one" in said
-    assert ("go on training: python -m train reach --agent then --calibration NEW" in said) != enough
+    command = "python -m train reach --agent then --calibration new --preset payload"
+    assert (f"go on training: {command}" in said) != enough
