@@ -21,7 +21,7 @@ import numpy as np
 from calib.fit.blocks import held_out_blocks
 from calib.fit.held_pressures import without_redundant_part
 from calib.fit.leastsquares import QUANTILE, Problem, Solution, fit
-from calib.fit.pose_errors import PoseErrors, errors_of
+from calib.fit.pose_errors import PoseErrors, change_errors
 from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.control import chambers_of_springs
@@ -36,6 +36,7 @@ HELD_OUT_BLOCK = 4  # poses; neighbours on a circle are alike
 # pressures, and of one beside the others.
 ZERO_M, STIFFNESS, OFFSET_KPA = 1e-3, (0.1, 0.02), (0.5, 0.5)
 STEP_M = 5e-4  # of the finite differences
+_TURN = np.array([1, 1, 1, 2, 2, 2])  # a small turn is twice its Gibbs vector
 MIN_TIP_MM, MIN_TURN_RAD, MIN_KPA = 0.7, 0.015, 0.5  # least scales of the errors, which neighbours share
 
 
@@ -144,7 +145,7 @@ def _model(arm: _Calibrated, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndar
 
     # Errors of tips and pressures
     real = np.tile(pose_from_frame(poses.tip_m, poses.tip_rotation), (1 + n, 1))
-    tip = correction_between(real, np.asarray(pose, float)) * [1, 1, 1, 2, 2, 2]  # a turn is twice its Gibbs
+    tip = correction_between(real, np.asarray(pose, float)) * _TURN
     measured_kpa = without_redundant_part(np.tile(poses.pressure_kpa, (1 + n, 1)), spring_m, spec)
     simulated_kpa = np.asarray(found.pressure_kpa, float)
     if held is not None:
@@ -177,8 +178,7 @@ def _elastic_kpa(spec: ArmSpec, spring_m: np.ndarray) -> np.ndarray:
 
 def _pose_errors(error: np.ndarray) -> PoseErrors:
     """Sum up the errors (m, 6) [mm, rad] of tips that were measured, of arms that settled."""
-    known = error[np.isfinite(error[:, :6]).all(axis=1)]
-    return errors_of(np.linalg.norm(known[:, :3], axis=1), np.degrees(np.linalg.norm(known[:, 3:6], axis=1)))
+    return change_errors(error[np.isfinite(error[:, :6]).all(axis=1), :6] / _TURN)
 
 
 def _rms(values: np.ndarray) -> float:

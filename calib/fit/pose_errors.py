@@ -44,6 +44,10 @@ def errors_of(
 
 def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:
     """Compare poses (n, 6) [mm, deg] with real ones."""
-    change = correction_between(pose, real)
+    return change_errors(correction_between(pose, real))
+
+
+def change_errors(change: np.ndarray) -> PoseErrors:
+    """Sum up changes (n, 6) of poses: [mm] and Gibbs vectors, as `correction_between` returns them."""
     angle_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(change[:, 3:], axis=1)))
     return errors_of(np.linalg.norm(change[:, :3], axis=1), angle_deg)

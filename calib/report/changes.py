@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from calib.changes import Changes
-from calib.report.page import ReportTable, Section
+from calib.report.page import ReportTable, Section, plain
 
 CHANGES = "Changes"
 ENOUGH = 2.0  # held-out error over that of the calibration, from which there is a warning; by hand
@@ -23,9 +23,14 @@ def changes_section(found: Changes, known_mm: float) -> Section:
     # Tables of the springs, the chambers and the errors
     springs = _rows("spring", 1e3 * found.zero_m, 1e3 * found.zero_half_width_m)
     chambers = _rows("chamber", 100 * found.stiffness, found.offset_kpa)
-    errors = (
-        ("before", found.before.translation_mean_mm, found.before.rotation_mean_deg, found.before_kpa),
-        ("with the changes", found.after.translation_mean_mm, found.after.rotation_mean_deg, found.after_kpa),
+    errors = tuple(
+        (what, tip.translation_mean_mm, tip.rotation_mean_deg, kpa)
+        if tip.n
+        else (what, "not measured", "not measured", kpa)
+        for what, tip, kpa in (
+            ("before", found.before, found.before_kpa),
+            ("with the changes", found.after, found.after_kpa),
+        )
     )
     tables = (
         ReportTable(("", "zero [mm]", "+-"), springs),
@@ -48,7 +53,7 @@ def changes_section(found: Changes, known_mm: float) -> Section:
         "Intervals are 95 %; contiguous blocks of poses are held out.",
         tables,
         warnings,
-        _data(found),
+        plain(found, "spec") | {"is_better": found.is_better},
         notes=(_sentence(found),),
     )
 
@@ -62,19 +67,9 @@ def _sentence(found: Changes) -> str:
         return "nothing has changed that these poses show: the calibration stays as it is"
     zero_mm = ", ".join(f"{x:+.1f}" for x in 1e3 * found.zero_m)
     mean, half = 100 * found.stiffness.mean(), 100 * found.mean_half_width
-    return (
-        f"zeros of the springs {zero_mm} mm; stiffness of the chambers {mean:+.0f} +- {half:.0f} %; tips at "
-        f"held-out poses {found.before.translation_mean_mm:.1f} mm off before, "
-        f"{found.after.translation_mean_mm:.1f} mm now"
-    )
-
-
-def _data(found: Changes) -> dict[str, Any]:
-    """Return the numbers as JSON has them."""
-    arrays = {"zero_m", "zero_half_width_m", "stiffness", "offset_kpa"}
-    numbers = {"mean_half_width", "n", "before_kpa", "after_kpa", "is_better"}
-    return (
-        {name: np.asarray(getattr(found, name)).tolist() for name in sorted(arrays)}
-        | {name: getattr(found, name) for name in sorted(numbers)}
-        | {name: vars(getattr(found, name)) for name in ("before", "after")}
-    )
+    what = f"zeros of the springs {zero_mm} mm; stiffness of the chambers {mean:+.0f} +- {half:.0f} %"
+    if not found.before.n:  # no motion capture
+        off = f"{found.before_kpa:.2f} kPa off before, {found.after_kpa:.2f} now"
+        return f"{what}; pressures at held-out poses {off}"
+    before_mm, after_mm = found.before.translation_mean_mm, found.after.translation_mean_mm
+    return f"{what}; tips at held-out poses {before_mm:.1f} mm off before, {after_mm:.1f} mm now"

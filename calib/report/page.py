@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
@@ -42,7 +44,7 @@ def to_json(
         "trustworthy": not any(section.warnings for section in sections),
         "parts": {
             section.title: {
-                "figures": section.data,
+                "figures": as_json(section.data),
                 "warnings": list(section.warnings),
                 "notes": list(section.notes),
             }
@@ -78,3 +80,22 @@ def _png(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return base64.b64encode(buffer.getvalue()).decode()
+
+
+def plain(fit: Any, *left_out: str) -> dict[str, Any]:
+    """Return the fields of a fit as JSON has them."""
+    fields = fit._asdict() if hasattr(fit, "_asdict") else vars(fit)
+    return {name: as_json(value) for name, value in fields.items() if name not in (*left_out, "warnings")}
+
+
+def as_json(value: Any) -> Any:
+    """Return a value as JSON has it: null for a number that is not known."""
+    if hasattr(value, "_asdict") or dataclasses.is_dataclass(value):
+        return plain(value)
+    if isinstance(value, Mapping):
+        return {name: as_json(item) for name, item in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return as_json(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [as_json(item) for item in value]
+    return None if isinstance(value, float) and np.isnan(value) else value

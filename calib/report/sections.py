@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from calib.fit.parameters import BENDING, without_effect
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
-from calib.report.page import ReportTable, Section
+from calib.report.page import ReportTable, Section, as_json, plain
 from mjx_softarm._support.fields import PerSection
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.sensing.s2r import correct
@@ -62,7 +61,7 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_
         "Intervals are 95 %; contiguous blocks of rows are held out.",
         (ReportTable(head, rows),),
         fit.warnings,
-        _plain(fit),
+        plain(fit),
         (("residuals of the lines", figure),),
     )
 
@@ -111,7 +110,7 @@ def chambers(fit: ChamberFit) -> Section:
         + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
         (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
-        _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
+        plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
         | {"values": values | {BENDING: bending} | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
         fit.notes,
@@ -153,7 +152,7 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
     return dataclasses.replace(
         section,
         tables=(*section.tables, table),
-        data=section.data | {"markers": _plain(limits)},
+        data=section.data | {"markers": plain(limits)},
         figures=(*section.figures, (title, figure)),
     )
 
@@ -189,7 +188,7 @@ def actuators(fit: ActuatorFit) -> Section:
             ReportTable(("pressures", "RMS [kPa]"), errors),
         ),
         fit.warnings,
-        _plain(fit, "spec", "notes") | {"kind": found.kind, "values": _json(dataclasses.asdict(found))},
+        plain(fit, "spec", "notes") | {"kind": found.kind, "values": as_json(dataclasses.asdict(found))},
         notes=fit.notes,
     )
 
@@ -216,7 +215,7 @@ def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
         "measured pressures against the measured tip. Intervals are 95 %.",
         tuple(tables),
         fit.warnings,
-        _plain(fit, "spec") | {"values": values, "shape": shape and _plain(shape, "spec")},
+        plain(fit, "spec") | {"values": values, "shape": shape and plain(shape, "spec")},
     )
 
 
@@ -250,7 +249,7 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (errors,),
         fit.warnings,
-        _plain(fit, "s2r", "held_out") | {"n_unsettled": n_unsettled},
+        plain(fit, "s2r", "held_out") | {"n_unsettled": n_unsettled},
         (("held-out poses with and without the network", figure),),
     )
 
@@ -288,20 +287,6 @@ def _errors(*rows: tuple[str, PoseErrors]) -> ReportTable:
     head = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
     shown = ((what, e.n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for what, e in rows)
     return ReportTable(head, tuple(shown))
-
-
-def _plain(fit: Any, *left_out: str) -> dict[str, Any]:
-    """Return the fields of a fit as JSON has them."""
-    fields = fit._asdict() if hasattr(fit, "_asdict") else vars(fit)
-    return {name: _json(value) for name, value in fields.items() if name not in (*left_out, "warnings")}
-
-
-def _json(value: Any) -> Any:
-    if hasattr(value, "_asdict") or dataclasses.is_dataclass(value):
-        return _plain(value)
-    if isinstance(value, Mapping):
-        return {name: _json(item) for name, item in value.items()}
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def _figure() -> tuple[Figure, Axes]:

@@ -1,5 +1,6 @@
 """Changes since a calibration, planted in poses of simulated arms."""
 
+import json
 import re
 
 import numpy as np
@@ -9,6 +10,7 @@ from calib.changes import fit_changes
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
 from calib.report.changes import CHANGES, changes_section
+from calib.report.page import to_html, to_json
 from calib.steps import changes
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import settle_many
@@ -73,6 +75,13 @@ def test_without_motion_capture_the_pressures_show_softer_chambers(spec):
     found = fit_changes(spec, None, unseen)
     assert found.is_better and found.before.n == 0
     assert found.stiffness.mean() == pytest.approx(SOFTER - 1.0, abs=0.015)
+    section = changes_section(found, known_mm=0.3)
+    assert re.search(r"pressures at held-out poses [0-9.]+ kPa off before, [0-9.]+ now$", section.notes[0])
+    report = json.loads(json.dumps(to_json([section], [], {}), allow_nan=False))
+    figures = report["parts"][CHANGES]["figures"]
+    assert figures["before"]["translation_mean_mm"] is None and figures["is_better"]
+    np.testing.assert_array_equal(figures["zero_m"], found.zero_m)
+    assert "nan" not in to_html("paper", [section], [], {})
 
 
 def test_an_arm_that_has_not_changed_keeps_its_calibration(spec):
