@@ -22,7 +22,7 @@ from calib.fit.motion.actuators import fit_actuators
 from calib.fit.motion.damping import FITTED, PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
-from calib.fit.payload import fit_payloads, payload_half_widths, payload_poses
+from calib.fit.payload import payload_half_widths, payload_poses
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
@@ -169,10 +169,10 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
         extras["s2r"] = fit.s2r
     if not held.is_better:
         return StepResult(spec, section, extras)
-    extras["held"] = process = fit_payloads(spec, held.held, poses)
+    extras["held"] = held.held
     spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
     largest_kg = spec.mass.largest_payload_kg
-    width_kg = payload_half_widths(process, payload_poses(spec), largest_kg)
+    width_kg = payload_half_widths(held.held, payload_poses(spec), largest_kg)
     section = sections.with_pressures(section, held, width_kg, LOOP.load_known * largest_kg)
     return StepResult(spec, section, extras)
 

@@ -4,8 +4,8 @@ A rod is recorded at random poses and calibrated without S2R, which payloads do 
 springs around the circle, with payloads that nobody tells. The springs are those that the shipped policy asks
 the specified arm for. With a kilogram some are out of reach, and the rod stays where its pressures end. The
 payload is told by generalised least squares with the calibration's own covariances, as the deployed network
-learns to tell it. The residual pressures are a line in the spring lengths, as before; or the process of each
-section; or this process with some poses of a known payload besides.
+learns to tell it. The residual pressures are a line in the spring lengths, as before, or the process of each
+section.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from benchmarks.harness.common import target
 from calib import steps
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.leastsquares import ridge
-from calib.fit.payload import fit_payloads, told_payload
+from calib.fit.payload import told_payload
 from calib.fit.s2r import simulate_poses
 from calib.read.logs import read_log
 from calib.read.measurements import measure as measurements_of
@@ -36,7 +36,6 @@ from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import S2R_SESSION
 from mjx_softarm.twin.rod_twin import RodTwin
 
-KNOWN_KG, N_KNOWN = 0.5, 50  # known payload of some poses
 PAYLOADS_G = (0, 500, 1000)
 N_ACTIONS = 5  # of the shipped policy towards each point
 N_READINGS = 25  # averaged: half a second
@@ -104,10 +103,6 @@ def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list
     columns = found.spring_m, poses.pressure_kpa, found.pressure_kpa
     rows = tuple(np.asarray(values[found.valid], float) for values in columns)
     held = fit_held_pressures(spec, *rows).held
-    # Some poses with a known payload.
-    arm.attach(KNOWN_KG)
-    loaded = log_at_rest(arm, random_pressures(spec, N_KNOWN, seed + 1_000), KNOWN_KG)
-    with_known = fit_payloads(spec, held, measurements_of([loaded], spec).poses.with_lengths(spec))
     # Hold it around the circle with payloads, and tell them.
     figures = []
     for payload_g in PAYLOADS_G:
@@ -118,7 +113,6 @@ def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list
         ways = {
             "line": told_by_line(spec, rows, read_m, kpa),
             "process": told_payload(spec, held, read_m, kpa),
-            f"process, {N_KNOWN} loaded poses": told_payload(spec, with_known, read_m, kpa),
         }
         for way, (told_kg, half_width_kg) in ways.items():
             off_g = 1e3 * told_kg - payload_g

@@ -63,7 +63,7 @@ def _compare(seed: int, poses: int, first: int, tests: int) -> dict[str, Any]:
     return {"random": random, "planned": _figures(calibrate(logs, spec), judge)}
 
 
-def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray, payload_kg: float = 0.0) -> Log:
+def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
     """Return a log of an arm at rest at pressures (n, n_chambers), each row the mean of a second."""
     rows: list[dict[str, np.ndarray]] = []
     for pressure in pressure_kpa:
@@ -83,7 +83,7 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray, payload_kg: float = 0.0)
         )
     n = len(pressure_kpa)
     columns: Any = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    kg = np.full(n, payload_kg)
+    kg = np.zeros(n)
     return Log(source="rod", row=np.arange(n) + 2, time_s=5.0 * np.arange(n), payload_kg=kg, **columns)
 
 

@@ -13,15 +13,7 @@ from scipy.linalg import cho_solve, cholesky
 
 from calib.fit.blocks import held_out_blocks
 from mjx_softarm.control import allocation, chambers_of_springs
-from mjx_softarm.sensing.held_pressures import (
-    POSE_FACTOR,
-    HeldPressures,
-    covariances,
-    kernel,
-    prior_factor,
-    residual,
-    sections_of,
-)
+from mjx_softarm.sensing.held_pressures import HeldPressures, kernel, residual, sections_of
 from mjx_softarm.spec import ArmSpec
 
 HELD_OUT_BLOCK = 5  # poses
@@ -71,34 +63,6 @@ def fit_held_pressures(
     return PressureFit(process, _rms(left_kpa[held_out]), _rms(after_kpa), float(np.sqrt(variance.mean())))
 
 
-def with_payloads(
-    held: HeldPressures,
-    spring_m: np.ndarray,
-    measured_kpa: np.ndarray,
-    light_kpa: np.ndarray,
-    effect_kpa: np.ndarray,
-) -> HeldPressures:
-    """Return a process whose factors are fitted to m poses with known payloads, by Bayes' rule.
-
-    Args:
-        held: process of the unloaded arm.
-        spring_m (m, n_springs) [m]: lengths at rest.
-        measured_kpa (m, n_chambers) [kPa]: pressures that held the arm at these lengths with its payloads.
-        light_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm there without a payload.
-        effect_kpa (m, n_chambers) [kPa]: change of these pressures by the payloads.
-    """
-    found = residual(held, spring_m, light_kpa)
-    left_kpa = measured_kpa - light_kpa - found.mean_kpa.reshape(light_kpa.shape)
-    noise = covariances(held, found.share)
-    k = np.arange(noise.shape[-1])
-    noise[:, k, k] += (POSE_FACTOR * effect_kpa) ** 2
-    weighed = effect_kpa[:, :, None] * np.linalg.inv(noise)  # (m, n, n)
-    prior = np.linalg.inv(held.factor_covariance)
-    covariance = np.linalg.inv(prior + np.sum(weighed * effect_kpa[:, None], axis=0))
-    mean = covariance @ (prior @ held.factor + np.einsum("mij,mj->i", weighed, left_kpa))
-    return held._replace(factor=mean, factor_covariance=covariance)
-
-
 def _process(
     spec: ArmSpec, spring_m: np.ndarray, pressure_kpa: np.ndarray, left_kpa: np.ndarray
 ) -> HeldPressures:
@@ -110,8 +74,7 @@ def _process(
     state, left_kpa = (state - centre) / scale, left_kpa[chosen].reshape(len(chosen), n_sections, -1)
     each = [_most_likely(state[:, s], left_kpa[:, s]) for s in range(n_sections)]
     length, noise, covariance = (np.array(x) for x in zip(*each, strict=True))
-    own = prior_factor(spec.n_chambers)
-    return HeldPressures(state, centre, scale, left_kpa, length, noise, covariance, *own)
+    return HeldPressures(state, centre, scale, left_kpa, length, noise, covariance)
 
 
 def _most_likely(state: np.ndarray, left_kpa: np.ndarray) -> tuple[float, float, np.ndarray]:

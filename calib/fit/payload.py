@@ -17,15 +17,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.fit.held_pressures import with_payloads, without_redundant_part
 from calib.fit.s2r import simulate_poses
-from calib.read.static_poses import StaticPoses
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.held_pressures import (
-    POSE_FACTOR,
     HeldPressures,
     covariances,
+    factor_covariance,
     kernel,
     residual,
     sections_of,
@@ -34,7 +32,6 @@ from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.spec import ArmSpec
 
 N_POSES, SEED = 400, 1  # poses over the workspace, and their seed
-LEAST_SHARE = 0.1  # least known payload that counts, in largest payloads
 
 
 class PayloadPoses(NamedTuple):
@@ -56,28 +53,9 @@ def payload_poses(spec: ArmSpec, n: int = N_POSES, seed: int = SEED) -> PayloadP
     return PayloadPoses(spring_m[both], light.pressure_kpa[both], effect[both])
 
 
-def fit_payloads(spec: ArmSpec, held: HeldPressures, poses: StaticPoses) -> HeldPressures:
-    """Return a process whose factors are fitted to those of the poses that have a known payload."""
-    kg, own_kg = poses.payload_kg, spec.mass.payload_kg
-    least_kg = own_kg + LEAST_SHARE * spec.mass.largest_payload_kg
-    known = np.isfinite(poses.spring_m).all(axis=1) & (kg >= least_kg)
-    found = [np.empty((0, n)) for n in (spec.n_springs, *3 * (spec.n_chambers,))]
-    for payload_kg in np.unique(kg[known]):
-        rows = np.flatnonzero(known & (kg == payload_kg))
-        arms = (spec.replace(mass={"payload_kg": each_kg}) for each_kg in (own_kg, payload_kg))
-        light, heavy = (simulate_poses(arm, poses.spring_m[rows]) for arm in arms)
-        both = light.valid & heavy.valid
-        spring_m = poses.spring_m[rows]
-        measured_kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
-        kpa = measured_kpa, light.pressure_kpa, heavy.pressure_kpa - light.pressure_kpa
-        for k, values in enumerate((spring_m, *kpa)):
-            found[k] = np.concatenate([found[k], values[both]])
-    return with_payloads(held, *found) if len(found[0]) else held
-
-
 def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float) -> np.ndarray:
     """Return half-widths (m,) [kg] of the 95 % intervals of a payload at poses."""
-    effect = held.factor * at.effect_kpa_per_kg
+    effect = at.effect_kpa_per_kg
     covariance = _covariance(held, at, np.full(len(effect), payload_kg))
     information = np.einsum("mi,mi->m", effect, np.linalg.solve(covariance, effect[..., None])[..., 0])
     return QUANTILE / np.sqrt(information)
@@ -115,17 +93,17 @@ def told_payload(
     left_kpa = pressure_kpa - light_kpa - found.mean_kpa.reshape(light_kpa.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
     for _ in range(2):
-        weight = np.linalg.solve(_covariance(held, at, payload_kg), (held.factor * effect)[..., None])[..., 0]
-        variance = 1.0 / np.sum(weight * held.factor * effect, axis=1)
+        weight = np.linalg.solve(_covariance(held, at, payload_kg), effect[..., None])[..., 0]
+        variance = 1.0 / np.sum(weight * effect, axis=1)
         payload_kg = variance * np.sum(weight * left_kpa, axis=1)
     return payload_kg, QUANTILE * np.sqrt(variance)
 
 
 def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -> np.ndarray:
     """Return covariances (m, n, n) [kPa^2] of the pressures that hold arms with payloads (m,) [kg]."""
-    own = held.factor_covariance + POSE_FACTOR**2 * np.eye(len(held.factor))
     effect = payload_kg[:, None] * at.effect_kpa_per_kg
     share = residual(held, at.spring_m, at.pressure_kpa).share
+    own = factor_covariance(effect.shape[1])
     return covariances(held, share) + effect[:, :, None] * own * effect[:, None]
 
 

@@ -209,7 +209,6 @@ def _record(
     plan: cli.MaybePath = None,
     seed: int = 0,
     transients: bool = False,
-    payload: float | None = None,
 ) -> int:
     """Log static poses at random pressures, for calibration; the first ten grow from a tenth of the range.
 
@@ -219,13 +218,10 @@ def _record(
         plan: pressures in place of random ones, from `python -m calib plan`
         seed: seed of the poses
         transients: log every tick, not the static poses alone
-        payload: mass [g] that hangs at the gripper; None: the specification's payload
     """
     # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
-    if payload is not None and not 0.0 <= payload < np.inf:
-        raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     arm_spec = ArmSpec.of(spec)
     check_file("--out", out)
     if out.exists():
@@ -236,8 +232,7 @@ def _record(
 
     # The recording and its results
     targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
-    hung_kg = None if payload is None else arm_spec.mass.payload_kg + 1e-3 * payload
-    result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out), hung_kg)
+    result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out))
     finish(driver, tell)
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)

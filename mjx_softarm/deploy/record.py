@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,7 +46,6 @@ def record(
     transients: bool = False,
     tell: Callable[[str], None] = lambda text: None,
     save: Callable[[Log], None] = lambda log: None,
-    payload_kg: float | None = None,
 ) -> PoseRecording:
     """Drive an arm through pressures, log it, and vent; `vent_at_end` says what else ends a recording.
 
@@ -58,7 +56,6 @@ def record(
         transients: log every tick instead of the static poses.
         tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.
-        payload_kg: payload that hangs at the gripper, for the log; None: the specification's.
     """
     rows, hold, rest = Recorder(), _Hold(), []
 
@@ -88,8 +85,7 @@ def record(
                 told_s = now_s
 
     def log() -> Log:
-        log = rows.log("record", drive.sensor)
-        return log if payload_kg is None else replace(log, payload_kg=np.full(len(log), payload_kg))
+        return rows.log("record", drive.sensor)
 
     ending = vent_at_end(run, drive.link, tell, lambda: save(log()) if len(rows) else None)
     return PoseRecording(log(), sum(rest), len(rest) - sum(rest), ending)

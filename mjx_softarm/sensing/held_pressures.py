@@ -10,9 +10,9 @@ the covariance V (c, c) between chambers,
 A payload is told from pressures: about 4 kPa of the paper's arm for each kilogram. The mean of the process
 corrects them. Its variance tells how well a payload is known: it is large far from the poses of the log.
 
-A payload changes a chamber's pressure by a factor f of what the simulation says. The log of an unloaded arm
-does not tell f: with all stiffnesses, areas and masses greater by the same share, it would be the same log.
-Poses with a known payload do. f is normal, and a pose adds a deviation of its own.
+A payload changes a chamber's pressure by a factor of what the simulation says. The log of an unloaded arm
+does not tell it: with all stiffnesses, areas and masses greater by the same share, it would be the same log.
+So the factors are normal about 1, with the deviations below.
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
@@ -28,8 +28,8 @@ from scipy.linalg import cho_factor, cho_solve
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
 
 # Standard deviations of the factors; by hand, from rods: of all chambers together, by masses and areas that
-# are off by some per cent; of each chamber; of each chamber at each pose.
-COMMON_FACTOR, OWN_FACTOR, POSE_FACTOR = 0.05, 0.1, 0.1
+# are off by some per cent; of each chamber at each pose.
+COMMON_FACTOR, OWN_FACTOR = 0.05, 0.14
 KIND = "pressures"
 PRESSURES_FILE = "pressures.npz"  # in the folder of a calibration, and of a run that was trained with it
 
@@ -44,8 +44,6 @@ class HeldPressures(NamedTuple):
     length: np.ndarray  # (s,) distance of states over which the residual changes
     noise: np.ndarray  # (s,) variance of what no state explains, over V
     covariance_kpa2: np.ndarray  # (s, c, c) V
-    factor: np.ndarray  # (s c,) mean of f
-    factor_covariance: np.ndarray  # (s c, s c) covariance of f
 
 
 class Residual(NamedTuple):
@@ -55,9 +53,9 @@ class Residual(NamedTuple):
     share: np.ndarray  # (m, s) variance, noise included, over V
 
 
-def prior_factor(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean (n,) and covariance (n, n) of the factors of n chambers without a known payload."""
-    return np.ones(n), COMMON_FACTOR**2 + OWN_FACTOR**2 * np.eye(n)
+def factor_covariance(n: int) -> np.ndarray:
+    """Return the covariance (n, n) of the factors by which n chambers answer to a payload at a pose."""
+    return COMMON_FACTOR**2 + OWN_FACTOR**2 * np.eye(n)
 
 
 def held_kpa(
@@ -77,13 +75,12 @@ def held_kpa(
         rng: generator that draws for each arm what the log does not tell; without one, means are returned.
     """
     found = residual(held, spring_m, light_kpa)
-    left_kpa, factor = found.mean_kpa, held.factor
+    left_kpa, factor = found.mean_kpa, 1.0
     if rng is not None:
-        root, shape = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
+        root, (m, n) = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
         normal = rng.standard_normal(left_kpa.shape)
         left_kpa = left_kpa + np.sqrt(found.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
-        factor = rng.multivariate_normal(factor, held.factor_covariance, len(spring_m))
-        factor = factor + POSE_FACTOR * rng.standard_normal(shape)
+        factor = rng.multivariate_normal(np.ones(n), factor_covariance(n), m)
     return light_kpa + left_kpa.reshape(light_kpa.shape) + factor * effect_kpa
 
 
@@ -156,8 +153,6 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
         "length": (s,),
         "noise": (s,),
         "covariance_kpa2": (s, c, c),
-        "factor": (n_chambers,),
-        "factor_covariance": (n_chambers, n_chambers),
     }
     arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
     held = HeldPressures(**arrays)

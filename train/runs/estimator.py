@@ -51,6 +51,7 @@ from mjx_softarm.spec import ArmSpec
 N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 4_096, 2_048
 MORE_PRESSURE = 0.25  # share of the pressure range that is added at either end
 WIDTH = 128  # width of the hidden layers
+N_DRAWS = 4  # of what a calibration leaves unknown, for each pose
 SD_WIDTH = 32  # width of those of the payload's error
 SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
 PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
@@ -127,7 +128,10 @@ def _loaded(spec: ArmSpec, held: HeldPressures | None, many_kg: np.ndarray, seed
     light = simulate_poses(spec, np.asarray(pool.spring_m))
     pool = jax.tree.map(lambda values: np.asarray(values)[light.valid], pool)
     effect_kpa = pool.pressure_kpa - light.pressure_kpa[light.valid]
-    return _with_pressures(spec, held, pool, effect_kpa, np.random.default_rng([seed, 2]))
+    # Several draws for each pose, as a network would learn a single one by heart.
+    rng = np.random.default_rng([seed, 2])
+    drawn = [_with_pressures(spec, held, pool, effect_kpa, rng) for _ in range(N_DRAWS)]
+    return jax.tree.map(lambda *values: jnp.concatenate(values), *drawn)
 
 
 def _with_pressures(
