@@ -3,10 +3,10 @@
 The parameters x are those of `calib.fit.parameters`. J holds the derivatives of all measurements by x, over
 the scales of their errors. The covariance of x is the inverse of the prior's precision plus the sum of J^T J
 over the poses. Poses are chosen one by one among candidates, each time the pose that reduces the sum of the
-variances most, in units of the tolerances, until every direction is expected to be known, but at most a
-third of the poses. As many and the poses that are left of this third are chosen to tell payloads
-(`calib.fit.payload`). The others are drawn as in k-means++: by the square of the distance to the nearest
-pose, times the error of the sim-to-real network there.
+variances most, in units of the tolerances, until every direction is expected to be known, but at most half
+of the poses. Where payloads are not known well (`calib.fit.payload`), the rest of this half is chosen to tell
+them. The others are drawn as in k-means++: by the square of the distance to the nearest pose, times the error
+of the sim-to-real network there.
 
 Source: Fedorov, "Theory of Optimal Experiments", 1972 (A-optimal design); Arthur, Vassilvitskii, "k-means++",
 SODA 2007.
@@ -31,7 +31,8 @@ from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.spec import ArmSpec
 
 KIND, RECORDED_FILE = "recorded", "recorded.npz"  # file in the folder of a calibration
-SHARE_INFORMATIVE, SHARE_PAYLOAD = 1 / 3, 1 / 3  # greatest shares of the poses for directions, for payloads
+SHARE_FAR = 0.5  # least share of the poses that are drawn by their distance
+KNOWN_SHARE = 0.02  # half-width of no payload, in largest payloads, from which no pose is spent on it
 MAX_CANDIDATES = 1500
 MARGIN = 2.0  # intervals of fits over intervals of this covariance, which takes errors for independent
 N_NEAREST = 8  # nearest poses whose errors are averaged
@@ -102,13 +103,14 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressur
     # Choose informative poses, then poses for the payload.
     payload = np.full(len(candidates), spec.mass.payload_kg)
     options = _derivatives(spec, candidates, payload, recorded.scale) * tolerance
-    informative, covariance = choose_informative(options, covariance, round(SHARE_INFORMATIVE * n))
+    informative, covariance = choose_informative(options, covariance, n - round(SHARE_FAR * n))
     telling, widths_kg = np.array([], int), None
     if held is not None:
-        n_payload = round((SHARE_INFORMATIVE + SHARE_PAYLOAD) * n) - len(informative)
         states = spring_m, candidates
         at, known = payload_poses(spec), informed(held, *(x[informative] for x in states))
-        telling = choose_for_payload(known, at, *states, n_payload, informative)
+        if np.median(payload_half_widths(known, at, 0.0)) > KNOWN_SHARE * spec.mass.largest_payload_kg:
+            n_left = n - round(SHARE_FAR * n) - len(informative)
+            telling = choose_for_payload(known, at, *states, n_left, informative)
         then = informed(known, *(x[telling] for x in states))
         widths_kg = tuple(float(np.median(payload_half_widths(x, at, 0.0))) for x in (held, then))
     # Choose poses far from all others; all but the first add to the information, too.

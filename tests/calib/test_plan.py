@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from calib.__main__ import main
+from calib.fit.held_pressures import fit_held_pressures
 from calib.plan import (
     RECORDED_FILE,
     Recorded,
@@ -18,6 +19,8 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support.archive import SealedFileError
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.pressure_plan import read_plan, write_plan
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.workspace import settle_many
 
 SMALL = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 
@@ -119,3 +122,18 @@ def test_pressures_beyond_the_limits_or_of_another_arm_are_refused(tmp_path):
         read_plan(tmp_path / "a.csv", SMALL)
     with pytest.raises(InputError, match="expected pressure0"):
         read_plan(tmp_path / "a.csv", ArmSpec.default())
+
+
+def test_poses_are_planned_for_the_payload_where_it_is_not_known():
+    """Residual pressures of a kilopascal without any pattern hide it, those of a pascal do not."""
+    pressure_kpa = random_pressures(SMALL, 60, 0)
+    spring_m = settle_many(SMALL, pressure_kpa).spring_m
+    scale = np.tile([1e-5, 1e-4, 1e-5], (2, 1))  # all directions are known
+    recorded = Recorded(pressure_kpa, np.zeros(60), np.ones(60), scale)
+    left_kpa = np.random.default_rng(1).normal(0.0, [[[1.0]], [[1e-3]]], (2, 60, 3))
+    for left, n_payload in zip(left_kpa, (10, 0), strict=True):
+        held = fit_held_pressures(SMALL, spring_m, pressure_kpa + left, pressure_kpa).held
+        found = plan(SMALL, recorded, 20, 0, held)
+        assert found.n_informative == 0 and found.n_payload == n_payload
+        now_kg, then_kg = found.half_width_kg
+        assert then_kg < now_kg if n_payload else then_kg == now_kg
