@@ -19,7 +19,7 @@ from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
 from calib.fit.motion.actuators import fit_actuators
-from calib.fit.motion.damping import FITTED, PRIOR, find_stretches, fit_damping
+from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
 from calib.fit.payload import payload_half_widths, payload_poses
@@ -129,7 +129,7 @@ def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     # The lag of the shape shows the backbone's damping by itself
     shape, prior = fit_shape(measurements.logs, spec), PRIOR
     if shape is not None and shape.is_better:
-        spec, prior = shape.spec, FITTED
+        spec, prior = shape.spec, min(shape.log_std, PRIOR)
     fit = fit_damping(stretches, spec, seed, prior)
     return StepResult(fit.spec if fit.is_better else spec, sections.damping(fit, shape))
 

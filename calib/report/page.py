@@ -98,4 +98,4 @@ def as_json(value: Any) -> Any:
         return as_json(value.tolist())
     if isinstance(value, (list, tuple)):
         return [as_json(item) for item in value]
-    return None if isinstance(value, float) and np.isnan(value) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -206,16 +206,25 @@ def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
         ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
     )
     tables = [ReportTable(("", "value", "+-"), tuple(rows)), ReportTable(("tip", "RMS [mm]"), errors)]
+    warnings, lag = fit.warnings, {}
     if shape is not None:
-        lags = (("before", shape.before_s, shape.before_rms_mm), ("fitted", shape.lag_s, shape.rms_mm))
-        tables.append(ReportTable(("lag of the shape behind the springs", "s", "tip, RMS [mm]"), lags))
+        width = shape.half_width_s if np.isfinite(shape.half_width_s) else "not known"
+        fitted = "fitted", shape.lag_s, width, shape.rms_mm
+        lags = ("before", shape.before_s, "", shape.before_rms_mm), fitted
+        tables.append(ReportTable(("lag of the shape behind the springs", "s", "+-", "tip, RMS [mm]"), lags))
+        lag = plain(shape, "spec") | {"half_width_s": as_json(shape.half_width_s)}
+    if shape is not None and shape.at_end:
+        warnings += (
+            f"the best lag of the shape, {shape.lag_s:.2g} s, is an end of those tried, and is not used: log "
+            "quicker motion, or check that times of springs and tip agree",
+        )
     return Section(
         "Damping",
         f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
         "measured pressures against the measured tip. Intervals are 95 %.",
         tuple(tables),
-        fit.warnings,
-        plain(fit, "spec") | {"values": values, "shape": shape and plain(shape, "spec")},
+        warnings,
+        plain(fit, "spec") | {"values": values, "shape": lag or None},
     )
 
 

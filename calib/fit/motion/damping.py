@@ -34,7 +34,6 @@ MIN_COUNTED_S = 2.0
 MAX_TOTAL_S = 24.0  # length of all stretches together
 CLUSTER_S = 1.0  # errors within this time are not independent
 PRIOR = 1.0  # standard deviation of the logarithms: a factor of e
-FITTED = 0.05  # that of a bending damping which is fitted already
 DIFFERENCE = 0.01  # change of a logarithm between two runs
 SCALE_M, MIN_SCALE_M = 2e-3, 1e-4  # standard deviation of the tip: first guess, least value
 KNOWN = 0.2  # relative half-width of an interval up to which a damping counts as known

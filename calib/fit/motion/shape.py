@@ -7,7 +7,11 @@ shares its bend. In motion the shares lag by a time constant T, which the backbo
     even(l) + U,    T U' = rest(l) - even(l) - U,
 
 with the tip's place rest(l) at rest with spring lengths l, and even(l) with sections that bend evenly.
-Neither pressures nor the chambers' damping take part. Errors of rest(l) are taken for linear in l.
+Neither pressures nor the chambers' damping take part. Errors of rest(l) are taken for linear in l. A row
+without a tip has no error, and U goes on there. Rows without lengths cut a log into parts.
+
+The interval of log T follows from the curvature of the cost, from the spread of its slope between blocks of
+`BLOCK_S`, and from the step between the T that are tried. Errors of rest(l) last as long as a pose.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.fit.leastsquares import QUANTILE
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.fields import scaled
 from mjx_softarm.logs.schema import Log
@@ -29,6 +34,8 @@ MIN_S = 10.0  # length of a part of a log
 SKIPPED_S = 3.0  # start of a part, before which the arm's motion is unknown
 EVERY_S = 0.1  # time between rows that are simulated
 LAGS_S = np.geomspace(0.02, 3.0, 41)
+LOG_STEP = float(np.log(LAGS_S[1] / LAGS_S[0]))
+BLOCK_S = 10.0  # errors within this time are not independent
 MARGIN = 0.98  # ratio of errors below which the fitted lag counts as better than the specification's
 
 
@@ -42,11 +49,22 @@ class ShapeFit:
     rms_mm: float
     before_rms_mm: float
     time_s: float
+    log_std: float  # standard deviation of the lag's logarithm; inf where the errors do not show it
+
+    @property
+    def at_end(self) -> bool:
+        """Whether the best lag is the first or the last one that was tried, so that others may be better."""
+        return self.lag_s in (LAGS_S[0], LAGS_S[-1])
 
     @property
     def is_better(self) -> bool:
         """Whether the fitted lag explains the tip better than the specification's."""
-        return self.rms_mm < MARGIN * self.before_rms_mm
+        return not self.at_end and self.rms_mm < MARGIN * self.before_rms_mm
+
+    @property
+    def half_width_s(self) -> float:
+        """Half-width of the lag's 95 % interval."""
+        return QUANTILE * self.log_std * self.lag_s
 
 
 def fit_shape(logs: Sequence[Log], spec: ArmSpec) -> ShapeFit | None:
@@ -61,24 +79,39 @@ def fit_shape(logs: Sequence[Log], spec: ArmSpec) -> ShapeFit | None:
         return None
 
     # Errors of each lag, of all parts
-    rms = np.array([_rms_mm(parts, lag_s) for lag_s in LAGS_S])
-    lag_s, before_s = float(LAGS_S[np.argmin(rms)]), spec.backbone.shape_lag_s
+    square_mm2 = np.array([_squares_mm2(parts, lag_s) for lag_s in LAGS_S])  # (lags, rows)
+    rms, before_s = np.sqrt(square_mm2.mean(axis=1)), spec.backbone.shape_lag_s
+    lag_s, blocks = float(LAGS_S[np.argmin(rms)]), _blocks(parts)
     bending = scaled(spec.backbone.bending_damping_nms_per_rad, lag_s / before_s)
     return ShapeFit(
         spec=spec.replace(backbone={"bending_damping_nms_per_rad": bending}),
         lag_s=lag_s,
         before_s=before_s,
         rms_mm=float(rms.min()),
-        before_rms_mm=_rms_mm(parts, before_s),
+        before_rms_mm=float(np.sqrt(_squares_mm2(parts, before_s).mean())),
         time_s=EVERY_S * sum(len(part[0]) for part in parts),
+        log_std=_log_std(np.stack([np.bincount(blocks, row) for row in square_mm2])),
     )
 
 
-Part = tuple[np.ndarray, np.ndarray, np.ndarray]  # l [m]; tip less even(l), rest(l) less even(l) [mm]
+def _log_std(cost: np.ndarray) -> float:
+    """Return the standard deviation of the best lag's logarithm from the costs (lags, blocks) of `LAGS_S`."""
+    k = int(np.argmin(cost.sum(axis=1)))
+    if not 0 < k < len(cost) - 1:
+        return np.inf
+    before, best, after = cost[k - 1 : k + 2]
+    slope, curvature = (after - before) / (2 * LOG_STEP), (before - 2 * best + after).sum() / LOG_STEP**2
+    if curvature <= 0.0 or len(slope) < 2:
+        return np.inf
+    return float(np.sqrt(len(slope) * np.var(slope, ddof=1) / curvature**2 + LOG_STEP**2 / 12.0))
+
+
+# l [m]; tip less even(l) [mm], NaN where the tip was not seen; rest(l) less even(l) [mm]
+Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _parts(log: Log, spec: ArmSpec) -> list[Part]:
-    """Return the parts of a log without gaps, one row each `EVERY_S`."""
+    """Return the parts of a log without gaps of time or lengths, one row each `EVERY_S`."""
     # Spring lengths, and the mounting
     readings, spring_m, tip_m = log.readings_of(spec.sensor), log.spring_m, log.tip_m
     if readings is not None:
@@ -88,31 +121,53 @@ def _parts(log: Log, spec: ArmSpec) -> list[Part]:
     params = ArmParams.from_spec(spec)
     base = Frame(np.asarray(params.mount.base_position_m), np.asarray(params.mount.base_rotation))
 
-    # Rows at regular times of each part, simulated at rest
+    # Rows at regular times of each part without a gap of times or lengths: a row less would shorten the lag
     found, time_s = [], log.time_s
-    cuts = np.flatnonzero(np.diff(time_s) > MAX_STEP_S) + 1
+    known = np.isfinite(spring_m).all(axis=1)
+    cuts = np.flatnonzero((np.diff(time_s) > MAX_STEP_S) | (known[1:] != known[:-1])) + 1
     for part in np.split(np.arange(len(log)), cuts):
         grid = np.arange(float(time_s[part[0]]), float(time_s[part[-1]]), EVERY_S)
         rows = part[np.searchsorted(time_s[part], grid + 1e-6, side="right") - 1]
-        rows = rows[np.isfinite(spring_m[rows]).all(axis=1) & np.isfinite(tip_m[rows]).all(axis=1)]
-        if len(rows) * EVERY_S < MIN_S:
+        seen = np.isfinite(tip_m[rows]).all(axis=1)
+        if not known[part[0]] or np.count_nonzero(seen) * EVERY_S < MIN_S:
             continue
         length_m, at_rest = spring_m[rows], simulate_poses(spec, spring_m[rows])
         if at_rest.valid.all():
             even_mm = even_pose(base, np.asarray(params.spring_site_m), length_m)[:, :3]
-            found.append((length_m, 1e3 * tip_m[rows] - even_mm, at_rest.pose[:, :3] - even_mm))
+            tip_mm = np.where(seen[:, None], 1e3 * tip_m[rows], np.nan)
+            found.append((length_m, tip_mm - even_mm, at_rest.pose[:, :3] - even_mm))
     return found
 
 
-def _rms_mm(parts: Sequence[Part], lag_s: float) -> float:
-    """Return the RMS distance of the tip [mm] with a lag, but for what is linear in the spring lengths."""
-    left, skipped = [], round(SKIPPED_S / EVERY_S)
-    for spring_m, measured_mm, rest_mm in parts:
+def _counted(part: Part) -> np.ndarray:
+    """Return which rows (n,) of a part count: those with a tip, after the first seconds."""
+    seen = np.isfinite(part[1]).all(axis=1)
+    return seen & (np.arange(len(seen)) >= round(SKIPPED_S / EVERY_S))
+
+
+def _blocks(parts: Sequence[Part]) -> np.ndarray:
+    """Return the block of each row that counts, of all parts one after the other."""
+    found, n = [], 0
+    for part in parts:
+        block = np.arange(len(part[0])) // round(BLOCK_S / EVERY_S)
+        found.append(n + block[_counted(part)])
+        n = found[-1].max() + 1
+    return np.unique(np.concatenate(found), return_inverse=True)[1]
+
+
+def _squares_mm2(parts: Sequence[Part], lag_s: float) -> np.ndarray:
+    """Return the squared distance of the tip with a lag in each row that counts.
+
+    The part of the distance that is linear in the spring lengths is left out.
+    """
+    left = []
+    for part in parts:
+        (spring_m, measured_mm, rest_mm), counted = part, _counted(part)
         uneven_mm, now_mm = np.empty_like(rest_mm), rest_mm[0]
         for k, target_mm in enumerate(rest_mm):
             now_mm = now_mm - np.expm1(-EVERY_S / lag_s) * (target_mm - now_mm)
             uneven_mm[k] = now_mm
-        error_mm = (measured_mm - uneven_mm)[skipped:]
-        linear = np.column_stack([np.ones(len(spring_m)), spring_m - spring_m.mean(axis=0)])[skipped:]
+        error_mm = (measured_mm - uneven_mm)[counted]
+        linear = np.column_stack([np.ones(len(spring_m)), spring_m - spring_m.mean(axis=0)])[counted]
         left.append(error_mm - linear @ np.linalg.lstsq(linear, error_mm, rcond=None)[0])
-    return float(np.sqrt(np.mean(np.sum(np.concatenate(left) ** 2, axis=1))))
+    return np.sum(np.concatenate(left) ** 2, axis=1)

@@ -5,27 +5,50 @@ import dataclasses
 import numpy as np
 import pytest
 
+from calib import steps
+from calib.fit.leastsquares import QUANTILE
+from calib.fit.motion import shape
+from calib.fit.motion.damping import DampingFit
 from calib.fit.motion.shape import fit_shape
+from calib.read.measurements import Measurements
+from calib.report import sections
+from calib.report.page import to_json
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.record import record
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import Build
 
+DAMPING = DampingFit(
+    spec=ArmSpec.default(),
+    half_width_95={"damping_ns_per_m": 1.0, "bending_damping_nms_per_rad": 0.01},
+    in_sample_rms_mm=1.0,
+    held_out_rms_mm=1.0,
+    held_out_before_rms_mm=2.0,
+    n_stretches=1,
+    time_s=10.0,
+    warnings=(),
+)
 SPEC = ArmSpec.default().replace(structure={"n_sections": 2, "links_per_section": 2})
+DT_S = 1.0 / SPEC.control.rate_hz
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, per_section=2)
 
 
-def log_of(factor):
-    """A log of an arm with the specification's bending damping times a factor."""
+def log_of(factor, n=4):
+    """A log of an arm with the specification's bending damping times a factor, at n random pressures."""
     damping = factor * SPEC.backbone.bending_damping_nms_per_rad
     arm = SPEC.replace(backbone={"bending_damping_nms_per_rad": damping})
-    return record(Twin(0, arm, build=IDEAL), arm, random_pressures(arm, 4, 0), transients=True).log
+    return record(Twin(0, arm, build=IDEAL), arm, random_pressures(arm, n, 0), transients=True).log
 
 
 @pytest.fixture(scope="module")
 def quick():
     return log_of(0.25)
+
+
+@pytest.fixture(scope="module")
+def long():
+    return log_of(0.5, n=16)
 
 
 def test_a_planted_damping_comes_back(quick):
@@ -34,6 +57,9 @@ def test_a_planted_damping_comes_back(quick):
     assert planted.is_better and planted.rms_mm < 0.7 * planted.before_rms_mm
     assert planted.spec.backbone.shape_lag_s == pytest.approx(planted.lag_s)
     assert planted.before_s == SPEC.backbone.shape_lag_s
+    for found, factor in ((own, 1.0), (planted, 0.25)):
+        off = np.log(found.lag_s / (factor * SPEC.backbone.shape_lag_s))
+        assert abs(off) < QUANTILE * found.log_std < 0.7
 
 
 def test_a_log_without_springs_tip_or_dense_rows_has_no_lag(quick):
@@ -43,3 +69,52 @@ def test_a_log_without_springs_tip_or_dense_rows_has_no_lag(quick):
     assert fit_shape(logs, SPEC) is None
     backbone = {"bending_damping_nms_per_rad": 0.0}
     assert fit_shape([quick], SPEC.replace(backbone=backbone)) is None
+
+
+@pytest.mark.parametrize("lost_from_s", [0.0, 4.5])
+def test_tips_that_were_not_seen_do_not_shorten_the_lag(long, lost_from_s):
+    """A quarter of the rows has no tip: 1.5 s in every 6 s."""
+    whole = fit_shape([long], SPEC)
+    lost = (long.time_s % 6.0 >= lost_from_s) & (long.time_s % 6.0 < lost_from_s + 1.5)
+    tip_m = np.where(lost[:, None], np.nan, long.tip_m)
+    found = fit_shape([dataclasses.replace(long, tip_m=tip_m)], SPEC)
+    assert found.lag_s == pytest.approx(whole.lag_s, rel=0.15)
+    assert found.log_std < 0.15
+
+
+def test_a_log_is_cut_where_lengths_are_missing(long):
+    readings = np.where((long.time_s % 25.0 > 23.5)[:, None], np.nan, long.readings)
+    found = fit_shape([dataclasses.replace(long, readings=readings)], SPEC)
+    parts = [long.take(np.flatnonzero(long.time_s // 25.0 == k)[: round(23.5 / DT_S)]) for k in range(4)]
+    assert found.lag_s == pytest.approx(fit_shape(parts, SPEC).lag_s, rel=1e-9)
+
+
+def test_a_lag_beyond_those_tried_is_not_believed(quick, monkeypatch):
+    monkeypatch.setattr(shape, "LAGS_S", shape.LAGS_S[shape.LAGS_S > 0.3])
+    found = fit_shape([quick], SPEC)
+    assert found.at_end and not found.is_better and found.log_std == np.inf
+    assert found.rms_mm < 0.98 * found.before_rms_mm
+    section = sections.damping(DAMPING, found)
+    assert "the best lag of the shape, 0.31 s, is an end of those tried" in section.warnings[-1]
+    assert to_json([section], [], {})["parts"]["Damping"]["figures"]["shape"]["log_std"] is None
+
+
+def test_the_report_tells_the_lag_s_own_interval(quick):
+    found = fit_shape([quick], SPEC)
+    section = sections.damping(DAMPING, found)
+    [before, fitted] = section.tables[-1].rows
+    assert fitted == ("fitted", found.lag_s, QUANTILE * found.log_std * found.lag_s, found.rms_mm)
+    assert before[2] == "" and section.warnings == DAMPING.warnings
+
+
+def test_the_damping_fit_has_the_interval_of_the_lag_as_its_prior(quick, monkeypatch):
+    asked = []
+
+    def fit(stretches, spec, seed, prior):
+        asked.append((spec.backbone.shape_lag_s, prior))
+        return dataclasses.replace(DAMPING, spec=spec)
+
+    monkeypatch.setattr(steps, "fit_damping", fit)
+    steps.damping(Measurements((quick,), None, {}), SPEC, 0)
+    found = fit_shape([quick], SPEC)
+    assert asked == [(pytest.approx(found.lag_s), found.log_std)]
