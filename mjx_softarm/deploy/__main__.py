@@ -31,7 +31,7 @@ from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.driven import Arms, finish
 from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
-from mjx_softarm.deploy.ending import MISSED, save_log
+from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.logs import mcap_file
@@ -175,18 +175,31 @@ def _measure(
         pace_s = seconds / max(len(poses) - 1, 1)
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     finish(driver, tell)
-    if not run.arrivals:
-        tell_run(run, controller.policy)
-        return run.status
+    if run.arrivals:
+        _tell_measured(run, controller, poses, out, payload_kg if seconds is None else None)
+    tell_run(run, controller.policy)
+    return run.status
 
-    # Figures, written and printed
+
+def _tell_measured(
+    run: LoopRun, controller: Controller, poses: np.ndarray, out: Path, payload_kg: float | None
+) -> None:
+    """Write and print the figures of a run, and what makes its error.
+
+    Args:
+        run: towards the poses, with an arrival or more.
+        controller: its policy.
+        poses (p, 6) [mm, deg]: goals.
+        out: folder to write to.
+        payload_kg: payload at the gripper; None: do not say what makes the error.
+    """
     accuracy = measure(run, controller, poses)
     found = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
         **(along(run, controller.dt_s) if run.ways else {}),
     }
-    split = budget(run, controller, payload_kg) if seconds is None else None
+    split = None if payload_kg is None else budget(run, controller, payload_kg)
     if split is not None:
         found["budget"] = split.figures()
     if missing := write_accuracy(out, accuracy, found):
@@ -197,8 +210,6 @@ def _measure(
     if split is not None:
         print("\n".join(split.lines()))
     print(f"figures: {out / 'accuracy.json'}")
-    tell_run(run, controller.policy)
-    return run.status
 
 
 def _record(

@@ -52,7 +52,7 @@ from mjx_softarm.control import TOLERANCE_M, Gains, allocation
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import Observation, ObsScale, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.policy.networks import ArmModel, take_networks
+from mjx_softarm.policy.networks import take_networks
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel
 from mjx_softarm.sensing.load import QUANTILE, LoadEstimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
@@ -123,63 +123,6 @@ def action_layout(spec: ArmSpec) -> tuple[str, ...]:
     return tuple(f"{spec.sensor.reading_name}{k}" for k in range(spec.n_springs))
 
 
-def policy_from_actor(
-    actor_params: Mapping[str, Any],
-    spec: ArmSpec,
-    reward: RewardConfig,
-    model: ArmModel,
-    provenance: Mapping[str, Any],
-    **settings: Any,
-) -> Policy:
-    """Make the policy of an actor that was trained on an arm.
-
-    Args:
-        actor_params: as flax initialises the actor, `{"params": {"hidden_0": {"kernel", "bias"}, ...,
-            "head": {"kernel", "bias"}}}`; the head's first n outputs are the mean, as many more the log
-            standard deviation.
-        spec: the arm; scales, limits, calibration and gains are its own, as in the environment.
-        reward: the environment's.
-        model: networks and workspace of the arm.
-        provenance: how the policy came about, in types that JSON has.
-        settings: fields of `Policy` that have defaults, from the environment and the evaluation:
-            `observation`, `tolerance_m`, `n_actions`, `action_s`.
-
-    Raises:
-        ValueError: the parameters are not those of an actor for this arm. It is a SealedFileError if an
-            array has the wrong shape or is not finite.
-    """
-    policy = Policy(
-        layers=_layers_from_flax(actor_params, spec.n_springs),
-        obs_scale=ObsScale.from_spec(spec),
-        reward=reward,
-        actions=ActionMap.from_spec(spec),
-        gains=Gains.from_spec(spec),
-        rate_hz=spec.control.rate_hz,
-        **model._asdict(),
-        spec=spec,
-        provenance=provenance,
-        **settings,
-    )
-    # Check the policy as if it had been read.
-    return _unpack(file_entries(policy), "policy")
-
-
-def check_actor(actor_params: Mapping[str, Any], spec: ArmSpec) -> None:
-    """Raise ValueError where the parameters, as of `policy_from_actor`, are not those of an actor."""
-    _layers_from_flax(actor_params, spec.n_springs)
-
-
-def _layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
-    """Return the actor's layers without its standard deviations; only this function knows flax's names."""
-    dense = actor_params.get("params", {})
-    names = [*(f"hidden_{k}" for k in range(len(dense) - 1)), "head"]
-    if set(dense) != set(names):
-        raise ValueError(f"actor parameters: got {sorted(dense)}, expected hidden_0, hidden_1, ... and head")
-    arrays = [[np.asarray(dense[name][part], np.float32) for part in ("kernel", "bias")] for name in names]
-    arrays[-1] = [array[..., :n_actions] for array in arrays[-1]]
-    return tuple((weight, bias) for weight, bias in arrays)
-
-
 def save_policy(path: str | Path, policy: Policy) -> None:
     """Check a policy and write it, whole or not at all; the same policy gives the same bytes.
 
@@ -201,6 +144,15 @@ def load_policy(path: str | Path) -> Policy:
             an entry is missing, unknown, or has a wrong type, shape or range.
     """
     return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
+
+
+def checked(policy: Policy) -> Policy:
+    """Return a policy as it would be read from its file.
+
+    Raises:
+        SealedFileError: the policy is not valid.
+    """
+    return _unpack(file_entries(policy), "policy")
 
 
 def file_entries(policy: Policy) -> dict[str, np.ndarray]:

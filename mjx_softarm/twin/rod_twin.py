@@ -187,14 +187,6 @@ def draw_rod(
     def factors(deviation: float, *shape: int) -> np.ndarray:
         return 1.0 + drawn(rng, deviation, *shape)
 
-    def holes(radius_m: PerSection, n: int) -> np.ndarray:
-        """Draw places (s, n, 2) of n holes in each section at equal angles."""
-        first = np.radians(of_section(geometry.first_chamber_deg) + spec.section_roll_deg)[:, None]
-        angle = first + 2 * np.pi * np.arange(n) / n
-        angle = angle + np.radians(drawn(rng, std.hole_angle_deg, s, n))
-        radius = of_section(radius_m)[:, None] + drawn(rng, std.hole_radius_m, s, n)
-        return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
     # Laws of the chambers, with random numbers of their own
     laws = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     range_kpa = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
@@ -217,8 +209,8 @@ def draw_rod(
         shear=stiff / np.maximum(std.shear_per_n, 1e-6),
         extension=of_section(backbone.axial_stiffness_n_per_m) * length_m * stiff,
         joint=np.stack([rotation_about(np.array([0.0, 0.0, roll])) for roll in roll_rad]),
-        chamber_hole_m=holes(geometry.chamber_radius_m, n_chambers),
-        spring_hole_m=holes(geometry.spring_radius_m, spec.springs_per_section),
+        chamber_hole_m=_holes(rng, spec, std, geometry.chamber_radius_m, n_chambers),
+        spring_hole_m=_holes(rng, spec, std, geometry.spring_radius_m, spec.springs_per_section),
         stiffness=of_chamber(chambers.stiffness_n_per_m) * factors(std.chamber_stiffness, *per_chamber),
         hardening=hardening,
         skew=drawn(laws, std.skew, *per_chamber),
@@ -232,6 +224,18 @@ def draw_rod(
         tool_offset_m=spec.mass.gripper_length_m * np.array([0.5, 1.0]),
         up=up,
     )
+
+
+def _holes(
+    rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, radius_m: PerSection, n: int
+) -> np.ndarray:
+    """Draw places (s, n, 2) of n holes in each section at equal angles."""
+    s, first_deg = spec.structure.n_sections, np.array(spec.per_section(spec.geometry.first_chamber_deg))
+    first = np.radians(first_deg + spec.section_roll_deg)[:, None]
+    angle = first + 2 * np.pi * np.arange(n) / n
+    angle = angle + np.radians(drawn(rng, std.hole_angle_deg, s, n))
+    radius = np.array(spec.per_section(radius_m))[:, None] + drawn(rng, std.hole_radius_m, s, n)
+    return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def draw_regulator(seed: int, spec: ArmSpec, deadband: float = 1.0) -> Regulator:
