@@ -1,113 +1,29 @@
-"""Motion capture over the loopback: poses, markers, and faults, against servers of the tests' own."""
+"""Motion capture over the loopback: poses, markers, names and commands, against servers of the tests' own."""
 
 import json
 import re
-import socket
-import time
 
 import numpy as np
 import pytest
 
 from calib.read.logs import read_log
-from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy import capture
 from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.capture import Delay, with_capture
 from mjx_softarm.deploy.capture.system import CaptureName
 from mjx_softarm.policy.file import save_policy
-from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_quaternion
-from tests.deploy.capture.servers import NatNetServer, QualisysServer, Scene
+from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
+from tests.deploy.capture.conftest import Arm
+from tests.deploy.capture.scene import (
+    MARKERS_M,
+    POSE,
+    SPEC,
+    SYSTEMS,
+    look,
+    scene_of,
+)
+from tests.deploy.capture.servers import NatNetServer, Scene
 from tests.linear_arm import POLICY, REST_M, SENSOR
-
-SPEC = ArmSpec.default()
-POSE = np.array([30.0, -40.0, -570.0, 12.0, -8.0, 5.0])
-MARKERS_M = np.array([[0.05, 0.0, -0.2], [0.0, 0.05, -0.4], [-0.05, 0.01, -0.55]])
-BASE_M, TURN = np.array([1.0, -0.5, 2.0]), frame_from_pose(np.array([0, 0, 0, 90.0, 3.0, -2.0]))[1]
-SYSTEMS = ["natnet", "qualisys"]
-
-
-class Arm:
-    extra = "the driver's own"
-
-    def read_sensors(self):
-        return np.ones(9)
-
-
-def to_y_up(x):
-    """(x, y, z) of a frame whose z points up, where y points up."""
-    return np.stack([x[..., 0], x[..., 2], -x[..., 1]], axis=-1)
-
-
-def scene_of(pose=POSE, base=True, up="z", hidden=1):
-    """The arm at a pose in its base frame, as a system sees it whose axes differ."""
-    at_m, axes = frame_from_pose(pose)
-    base_m, turn = (BASE_M, TURN) if base else (np.zeros(3), np.eye(3))
-    poses = {"base": (base_m, turn), "tip": (base_m + turn @ at_m, turn @ axes)}
-    markers_m = base_m + MARKERS_M @ turn.T
-    markers_m[hidden] = np.nan
-    if up == "y":
-        change = to_y_up(np.eye(3)).T  # columns are the old axes in the new ones
-        poses = {name: (to_y_up(at), change @ axes @ change.T) for name, (at, axes) in poses.items()}
-        markers_m = to_y_up(markers_m)
-    return Scene(poses, markers_m)
-
-
-@pytest.fixture
-def serve(monkeypatch, request):
-    """Return what starts a server of a system, on a port of its own."""
-
-    def make(system, scene, **options):
-        module = pytest.importorskip(
-            {"natnet": "natnet", "qualisys": "qtm_rt"}[system], reason="pip install -e '.[capture]'"
-        )
-        assert module
-        server = (NatNetServer if system == "natnet" else QualisysServer)(scene, **options)
-        port = "natnet.COMMAND_PORT" if system == "natnet" else "qualisys.PORT"
-        monkeypatch.setattr(f"mjx_softarm.deploy.capture.{port}", server.port)
-        request.addfinalizer(lambda: server.__exit__())
-        return server.__enter__()
-
-    return make
-
-
-@pytest.fixture
-def opened(request):
-    """Return what opens an arm with motion capture, and lines that it tells."""
-
-    def make(name, spec=SPEC):
-        lines = []
-        arm = with_capture(Arm(), name, spec, lines.append)
-        request.addfinalizer(arm._source.close)
-        return arm, lines
-
-    return make
-
-
-def look(arm, tries=200):
-    """Return the next frame that is not missed."""
-    seen = set()
-    for _ in range(tries):
-        try:
-            return arm.motion_capture()
-        except OSError as error:
-            seen.add(str(error))
-            time.sleep(0.005)
-    raise AssertionError(f"no frame came: {seen}")
-
-
-def missed(arm, message, tries=200):
-    """Wait for a frame that is missed for this reason."""
-    seen = []
-    for _ in range(tries):
-        try:
-            arm.motion_capture()
-        except OSError as error:
-            seen.append(str(error))
-            if re.search(message, seen[-1]):
-                return
-        time.sleep(0.005)
-    raise AssertionError({*seen})
 
 
 @pytest.mark.parametrize(
@@ -147,124 +63,6 @@ def test_a_multicast_stream_is_found(serve, opened, monkeypatch):
     np.testing.assert_allclose(1e3 * seen.tip_m, POSE[:3], atol=1e-2)
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_a_lost_body_is_a_gap_that_is_told(system, serve, opened, monkeypatch):
-    scene = scene_of()
-    serve(system, scene)
-    arm, lines = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
-    look(arm)
-    scene.hidden = {"base"}  # which does not move
-    for _ in range(10):
-        np.testing.assert_allclose(1e3 * look(arm).tip_m, POSE[:3], atol=1e-2)
-    scene.hidden = {"tip"}
-    missed(arm, "got a frame without the body 'tip'")
-    monkeypatch.setattr(capture, "LOST_S", 0.05)
-    while not lines:
-        missed(arm, "'tip'")
-    monkeypatch.undo()
-    scene.hidden = set()
-    look(arm)
-    assert re.fullmatch("motion capture: lost: got .*", lines[0])
-    assert re.fullmatch(r"motion capture: back after \d+\.\d s", lines[1]) and len(lines) == 2
-    text = arm.finish()
-    assert re.search(r"the tip was seen in \d+ of \d+ ticks; .*at most \d+ ms later", text)
-    assert ("sent 4.0 ms after the exposure" in text) == (system == "natnet")
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_late_frames_are_missed(system, serve, opened):
-    scene = scene_of()
-    serve(system, scene)
-    arm, _ = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
-    look(arm)
-    scene.held = True  # frames are made but not sent
-    missed(arm, "got no new frame from 127.0.0.1")
-    time.sleep(0.1)
-    scene.mute = True  # none is made from now on
-    time.sleep(0.2)
-    scene.held = False
-    missed(arm, r"got a frame \d+ ms late, expected 50 at most")
-    scene.mute = False
-    look(arm)
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_a_server_that_goes_does_not_hold_up_the_loop_and_may_come_back(system, serve, opened, monkeypatch):
-    monkeypatch.setattr(f"mjx_softarm.deploy.capture.{system}.AGAIN_S", 0.05)
-    monkeypatch.setattr(capture, "LOST_S", 0.05)
-    server = serve(system, scene_of())
-    arm, _ = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
-    look(arm)
-    server.__exit__()
-    missed(arm, "got no new frame" if system == "natnet" else "got an end of the connection")
-    begin_s = time.monotonic()
-    for _ in range(100):
-        with pytest.raises(OSError):
-            arm.motion_capture()
-    assert time.monotonic() - begin_s < 100 * 0.02
-    scene = scene_of()
-    scene.bodies = dict(reversed(scene.bodies.items()))  # they have other numbers now
-    again = serve(system, scene, **({"port": server.port} if system == "qualisys" else {}))
-    if system == "natnet":  # the same port is asked
-        arm._source._client._NatNetClient__command_port = again.port
-    np.testing.assert_allclose(1e3 * look(arm, 1000).tip_m, POSE[:3], atol=1e-2)
-
-
-def test_a_body_that_the_system_does_not_describe_is_no_base(serve, opened):
-    scene = scene_of(base=False)
-    scene.bodies["ghost"], scene.unnamed = (np.ones(3), np.eye(3)), {"ghost"}
-    serve("natnet", scene)
-    arm, _ = opened("natnet:127.0.0.1:tip,up=z")
-    for _ in range(5):
-        np.testing.assert_allclose(1e3 * look(arm).tip_m, POSE[:3], atol=1e-2)
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_frames_that_queued_up_are_not_taken_for_new_ones(system, serve, opened, monkeypatch):
-    monkeypatch.setattr("mjx_softarm.deploy.capture.natnet.AGAIN_S", 100.0)
-    monkeypatch.setattr(capture, "LOST_S", 0.2)
-    scene = scene_of(base=False)
-    serve(system, scene)
-    arm, _ = opened(f"{system}:127.0.0.1:tip,up=z")
-    look(arm)
-    for _ in range(2):
-        time.sleep(0.5)  # 100 frames
-        place_m, axes = scene.bodies["tip"]
-        scene.bodies["tip"] = place_m + 0.01, axes
-        time.sleep(0.05)
-        np.testing.assert_allclose(look(arm).tip_m, place_m + 0.01, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [("bodies", "got no body 'tip', expected one of base"), ("version", "got the answer .*Parse error")],
-)
-def test_a_server_that_comes_back_wrong_is_told_why_and_asked_on(wrong, message, serve, opened, monkeypatch):
-    """The host is looked up once. A connection that is of no use is closed."""
-    monkeypatch.setattr("mjx_softarm.deploy.capture.qualisys.AGAIN_S", 0.05)
-    monkeypatch.setattr(capture, "LOST_S", 0.05)
-    server = serve("qualisys", scene_of())
-    arm, _ = opened("qualisys:localhost:tip,base=base,up=z")
-    look(arm)
-    server.__exit__()
-    asked = []
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *args, **_: asked.append(args))
-    again = QualisysServer(scene_of(), port=server.port)
-    bodies = again.scene.bodies
-    if wrong == "bodies":
-        again.scene.bodies = {"base": bodies["base"]}
-    else:
-        again.refuses = wrong
-    with again:
-        for n in (2, 4):
-            while again.n_dropped < n:
-                missed(arm, f"got an end of the connection by localhost.*{message}")
-        assert again.n_accepted - again.n_dropped <= 1
-        again.scene.bodies, again.refuses = bodies, ""
-        np.testing.assert_allclose(1e3 * look(arm, 1000).tip_m, POSE[:3], atol=1e-2)
-        assert not asked
-
-
 @pytest.mark.parametrize(
     ("system", "rest", "message"),
     [
@@ -293,39 +91,6 @@ def test_an_arm_that_stands_is_seen_above_its_base(serve, opened):
     serve("qualisys", scene_of(standing, base=False))
     seen = look(opened("qualisys:127.0.0.1:tip", spec)[0])
     np.testing.assert_allclose(1e3 * seen.tip_m, standing[:3], atol=1e-2)
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_a_body_that_is_not_seen_at_first_is_refused(system, serve, opened):
-    scene = scene_of()
-    scene.hidden = {"tip"}
-    serve(system, scene)
-    with pytest.raises(InputError, match="got .*'tip', expected one with the tip within 1 s"):
-        opened(f"{system}:127.0.0.1:tip,base=base,up=z")
-
-
-def test_servers_that_do_not_answer_are_named(serve, opened, monkeypatch):
-    for system in SYSTEMS:
-        monkeypatch.setattr(f"mjx_softarm.deploy.capture.{system}.WAIT_S", 0.2)
-        server = serve(system, scene_of())
-        server.scene.mute = True
-        with pytest.raises(InputError, match=f"--capture {system}:.*got no .*frame from 127.0.0.1"):
-            opened(f"{system}:127.0.0.1:tip")
-        server.__exit__()
-        with pytest.raises(InputError, match=f"--capture {system}:.*got no (answer|connection)"):
-            opened(f"{system}:127.0.0.1:tip")
-
-
-def test_packets_that_cannot_be_read_are_gaps(serve, opened, monkeypatch):
-    scene = scene_of()
-    server = serve("natnet", scene)
-    arm, _ = opened("natnet:127.0.0.1:tip,base=base,up=z")
-    whole = server.frame
-    monkeypatch.setattr(server, "frame", lambda *args: whole(*args)[:90])
-    missed(arm, "got a packet that cannot be read")
-    monkeypatch.undo()
-    server.frame = whole
-    look(arm)
 
 
 @pytest.mark.parametrize(
