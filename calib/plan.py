@@ -112,7 +112,8 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressur
             n_left = n - round(SHARE_FAR * n) - len(informative)
             telling = choose_for_payload(known, at, *states, n_left, informative)
         then = informed(known, *(x[telling] for x in states))
-        widths_kg = tuple(float(np.median(payload_half_widths(x, at, 0.0))) for x in (held, then))
+        before_kg, then_kg = (float(np.median(payload_half_widths(x, at, 0.0))) for x in (held, then))
+        widths_kg = before_kg, then_kg
     # Choose poses far from all others; all but the first add to the information, too.
     chosen = np.concatenate([informative, telling])
     far = choose_far(spec, recorded, candidates, chosen, n - len(chosen), rng)

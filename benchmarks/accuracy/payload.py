@@ -101,8 +101,8 @@ def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list
     poses = measurements_of(logs, spec).poses.with_lengths(spec)
     found = simulate_poses(spec, poses.spring_m)
     columns = found.spring_m, poses.pressure_kpa, found.pressure_kpa
-    rows = tuple(np.asarray(values[found.valid], float) for values in columns)
-    held = fit_held_pressures(spec, *rows).held
+    spring_m, measured, simulated = (np.asarray(values[found.valid], float) for values in columns)
+    held = fit_held_pressures(spec, spring_m, measured, simulated).held
     # Hold it around the circle with payloads, and tell them.
     figures = []
     for payload_g in PAYLOADS_G:

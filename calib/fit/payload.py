@@ -45,7 +45,7 @@ class PayloadPoses(NamedTuple):
 def payload_poses(spec: ArmSpec, n: int = N_POSES, seed: int = SEED) -> PayloadPoses:
     """Return poses at n random pressures, without those at which the arm does not settle."""
     found = settle_many(spec, random_pressures(spec, n, seed))
-    spring_m, payload_kg = found.spring_m[found.settled], spec.mass.largest_payload_kg
+    spring_m, payload_kg = np.asarray(found.spring_m)[found.settled], spec.mass.largest_payload_kg
     loaded = spec.replace(mass={"payload_kg": spec.mass.payload_kg + payload_kg})
     light, heavy = (simulate_poses(arm, spring_m) for arm in (spec, loaded))
     both = light.valid & heavy.valid
