@@ -102,7 +102,7 @@ def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list
     found = simulate_poses(spec, poses.spring_m)
     columns = found.spring_m, poses.pressure_kpa, found.pressure_kpa
     spring_m, measured, simulated = (np.asarray(values[found.valid], float) for values in columns)
-    held = fit_held_pressures(spec, spring_m, measured, simulated).held
+    rows, held = (spring_m, measured, simulated), fit_held_pressures(spec, spring_m, measured, simulated).held
     # Hold it around the circle with payloads, and tell them.
     figures = []
     for payload_g in PAYLOADS_G:

@@ -170,7 +170,7 @@ def _lag_s(spec: ArmSpec) -> np.ndarray:
     def springs(pressure_kpa: np.ndarray) -> np.ndarray:
         found = settle_many(spec, pressure_kpa.reshape(-1, n))
         # A chamber counts as moving nothing where one of its two arms does not settle.
-        known: np.ndarray = np.asarray(found.settled).reshape(2, n).all(axis=0)
+        known = np.asarray(np.asarray(found.settled).reshape(2, n).all(axis=0))
         return np.where(known[:, None], np.asarray(found.spring_m, float).reshape(2, n, -1), 0.0)
 
     return law_lag_s(gains, springs, middle_kpa(gains, n))

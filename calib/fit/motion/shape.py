@@ -123,12 +123,12 @@ def _parts(log: Log, spec: ArmSpec) -> list[Part]:
 
     # Rows at regular times of each part without a gap of times or lengths: a row less would shorten the lag
     found, time_s = [], log.time_s
-    known: np.ndarray = np.isfinite(spring_m).all(axis=1)
+    known = np.asarray(np.isfinite(spring_m).all(axis=1))
     cuts = np.flatnonzero((np.diff(time_s) > MAX_STEP_S) | (known[1:] != known[:-1])) + 1
     for part in np.split(np.arange(len(log)), cuts):
         grid = np.arange(float(time_s[part[0]]), float(time_s[part[-1]]), EVERY_S)
         rows = part[np.searchsorted(time_s[part], grid + 1e-6, side="right") - 1]
-        seen: np.ndarray = np.isfinite(tip_m[rows]).all(axis=1)
+        seen = np.asarray(np.isfinite(tip_m[rows]).all(axis=1))
         if not known[part[0]] or np.count_nonzero(seen) * EVERY_S < MIN_S:
             continue
         length_m, at_rest = spring_m[rows], simulate_poses(spec, spring_m[rows])
@@ -141,7 +141,7 @@ def _parts(log: Log, spec: ArmSpec) -> list[Part]:
 
 def _counted(part: Part) -> np.ndarray:
     """Return which rows (n,) of a part count: those with a tip, after the first seconds."""
-    seen: np.ndarray = np.isfinite(part[1]).all(axis=1)
+    seen = np.asarray(np.isfinite(part[1]).all(axis=1))
     return seen & (np.arange(len(seen)) >= round(SKIPPED_S / EVERY_S))
 
 
