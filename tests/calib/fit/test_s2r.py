@@ -129,7 +129,9 @@ def test_held_out_rows_take_no_part_and_the_seed_decides(spec, arms):
     shifted[once.held_out, :3] += 50.0
     stretched[once.held_out] *= 3.0
     again = fit_s2r(spec, simulated._replace(spring_m=stretched), shifted, seed=7, config=BRIEF)
-    jax.tree.map(np.testing.assert_array_equal, again.s2r, once.s2r)
+    assert again.s2r.error_mm > 10.0 > once.s2r.error_mm  # they judge it, and nothing else
+    judged_alike = again.s2r._replace(error_mm=once.s2r.error_mm)
+    jax.tree.map(np.testing.assert_array_equal, judged_alike, once.s2r)
     other = fit_s2r(spec, simulated, true, seed=8, config=BRIEF)
     assert not np.array_equal(other.s2r.layers[0][0], once.s2r.layers[0][0])
 
