@@ -15,9 +15,10 @@ def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
     policy = tmp_path / "policy.npz"
     policy.write_bytes(policy_file.read_bytes())
     monkeypatch.setattr(command, "export_run", lambda run, arm, out: policy)
-    monkeypatch.setattr(command, "arm_model", lambda spec, s2r, folder, tell: None)
+    monkeypatch.setattr(command, "arm_model", lambda *arguments: None)
     monkeypatch.setattr(command, "check_policy", lambda run: None)
-    monkeypatch.setattr(command.Run, "open", lambda path: SimpleNamespace(spec=None, s2r=None))
+    run = SimpleNamespace(spec=None, s2r=None, held_pressures=lambda: None)
+    monkeypatch.setattr(command.Run, "open", lambda path: run)
     with few_golden_rows():
         assert command.export((tmp_path,), onnx=True, cpp=tmp_path / "cpp") == 0
     beside = {path.name for path in tmp_path.iterdir()}
