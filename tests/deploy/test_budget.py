@@ -91,7 +91,7 @@ def wrong_springs(*at):
             {"policy": WEAK},
             "springs end [0-9.]+ mm off their references, saturated at [1-8] goals",
         ),
-        ("payload", {"payload_kg": KG}, {"payload_kg": KG}, "believes 0 g and 1000 g hang"),
+        ("payload", {"payload_kg": KG}, {"payload_kg": KG}, "believes 0 g, and --payload says 1000 g"),
         ("springs", {"shift_m": SHIFT_M}, {}, r"spring1 \+[01]\.[0-9], spring3 -[01]\.[0-9]"),
     ],
 )

@@ -78,8 +78,8 @@ def _remedies(found: Budget) -> dict[str, str]:
         "law": f"{off}, saturated at {found.n_saturated} goals: take goals further inside, or less payload"
         if found.n_saturated
         else f"{off} although no chamber is saturated: look for a leak or a slow regulator",
-        "payload": f"the loop believes {found.believed_g:.0f} g and {found.payload_g:.0f} g hang there "
-        f"(--payload): {again}",
+        "payload": f"the loop believes {found.believed_g:.0f} g, and --payload says {found.payload_g:.0f} g: "
+        "record the poses of `calib plan`, and calibrate with them",
         "springs": f"zeros have shifted since the calibration, about [mm]: {zeros}: {again}",
         "estimator": "the distilled pose is off its simulation: only a finer network would help",
         "S2R": "as large as at the calibration's held-out poses: record the poses of `calib plan`",
