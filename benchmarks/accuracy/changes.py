@@ -39,10 +39,12 @@ def _measure(folder: Path, text: str, points: int) -> dict[str, Any]:
     """Measure an arm, the aged arm, and the aged arm once its calibration has gone on."""
     arm, run, calibration = three_of(text, "--arms", "ARM=RUN=CALIBRATION")
     folder.mkdir()
+    # The circle, before and after the arm has aged
     policy, later, renewed = Path(run) / "policy.npz", folder / "later", folder / "renewed.npz"
     circle = "--points", points
     first = accuracy_of(policy, arm, folder / "first", *circle)
     aged = accuracy_of(policy, f"{arm}:aged", folder / "aged", *circle)
+    # The calibration goes on with the aged circle's log; the policy gets its models
     go_on = "calib", "run", folder / "aged/log.npz", "--since", calibration, "--out", later
     run_command(*go_on, makes=later)
     export = "train", "export", run, "--calibration", later, "--out", renewed

@@ -28,7 +28,7 @@ SHADES = ("Blues", "Oranges", "Greens", "Purples")  # of the sections, in turn
 def measure(
     policy: Path, arm: str = "twin:0", loads: tuple[int, ...] = (0, 500, 1000), points: int = 20
 ) -> dict[str, Any]:
-    """What do readings, springs and pressures do on the circle, with and without a load, near a limit?
+    """How do readings, springs and pressures change on the circle, with and without a load, near a limit?
 
     The picture is `docs/results/traces.png`.
 

@@ -1,4 +1,4 @@
-"""What a GPU can do: environment steps and gradient steps a second at many sizes, and times to train.
+"""Speed of a GPU: environment steps and gradient steps a second at many sizes, and times to train.
 
 Programs prepare themselves beside each other and then take turns, so that the GPU is one program's while it
 is measured. A training is a sweep over seeds with sizes for a GPU. Its clock runs in its epochs alone: it
@@ -17,10 +17,8 @@ from typing import Any
 from benchmarks.accuracy.arms import run_command
 from benchmarks.harness.common import machine_kind, n_cores
 from benchmarks.harness.rounds import Worker, take_turns
-from benchmarks.speed.throughput import over_rounds
-from benchmarks.speed.truth import told_error
+from benchmarks.speed.throughput import figures_of
 from mjx_softarm._support import cli
-from mjx_softarm.spec import ArmSpec
 from train.sweep.run import open_sweep
 
 N_ROUNDS = 2
@@ -64,7 +62,7 @@ TRAININGS = {
 
 
 def measure(keep: cli.MaybePath = None) -> dict[str, Any]:
-    """What does a GPU do: steps a second of all engines at many sizes, and how long do trainings take?
+    """How fast is a GPU, with all engines at many sizes, and how long do trainings take?
 
     Args:
         keep: folder for the runs; without one they are deleted
@@ -85,17 +83,10 @@ def speed() -> dict[str, list[dict[str, Any]]]:
     rounds, failed = take_turns(list(workers.values()), N_ROUNDS, n_starting=max(2, n_cores()))
 
     def rows(points: Iterable[tuple[Any, ...]], keys: Sequence[str]) -> list[dict[str, Any]]:
-        found = []
-        for point in points:
-            worker = workers[point]
-            row: dict[str, Any] = dict(zip(keys, point, strict=True))
-            if told := rounds.get(worker.name):
-                row |= over_rounds([worker.facts | facts for facts in told])
-                row |= told_error(ArmSpec.default(), [worker.facts, *told])
-            else:
-                row["failed"] = failed[worker.name]
-            found.append(row)
-        return found
+        return [
+            dict(zip(keys, point, strict=True)) | figures_of(workers[point], rounds, failed)
+            for point in points
+        ]
 
     return {
         "env_steps": rows(steps, ("engine", "mode", "arms")),

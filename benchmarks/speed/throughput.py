@@ -11,7 +11,7 @@ that are solved at rest simulate no time, so they are not in that table.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,16 +104,18 @@ def programs_rows(workers: Iterable[Worker], peers: Sequence[Peer] = ()) -> list
             skipped.append({"program": name, "skipped": str(error)})
     # All take turns.
     rounds, failed = take_turns(workers, N_ROUNDS)
-    rows = []
-    for worker in workers:
-        row: dict[str, Any] = {"program": worker.name}
-        if told := rounds.get(worker.name):
-            row |= over_rounds([worker.facts | facts for facts in told])
-            row |= told_error(ArmSpec.default(), [worker.facts, *told])
-        else:
-            row["failed"] = failed[worker.name]
-        rows.append(row)
-    return rows + skipped
+    return [{"program": worker.name, **figures_of(worker, rounds, failed)} for worker in workers] + skipped
+
+
+def figures_of(
+    worker: Worker, rounds: Mapping[str, Sequence[Facts]], failed: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return the figures of a program over its rounds, or why it failed; arguments as of `take_turns`."""
+    told = rounds.get(worker.name)
+    if not told:
+        return {"failed": failed[worker.name]}
+    figures = over_rounds([worker.facts | facts for facts in told])
+    return figures | told_error(ArmSpec.default(), [worker.facts, *told])
 
 
 def over_rounds(rounds: Sequence[Facts]) -> dict[str, Any]:

@@ -206,6 +206,7 @@ def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
         ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
     )
     tables = [ReportTable(("", "value", "+-"), tuple(rows)), ReportTable(("tip", "RMS [mm]"), errors)]
+    # The shape's lag, where it could be fitted
     warnings, lag = fit.warnings, {}
     if shape is not None:
         width = shape.half_width_s if np.isfinite(shape.half_width_s) else "not known"

@@ -57,6 +57,7 @@ def arm_model(
         SpecError: the arm settles at too few pressures.
     """
     file, key = folder and folder / ESTIMATORS_FILE, _key(spec, held)
+    # Take the networks of the folder or of this process, else distil them
     if file and (kept := _read(file, key, spec)):
         networks, errors = kept
     else:
@@ -69,6 +70,7 @@ def arm_model(
             name: {f"{kg:g} kg": error._asdict() for kg, error in by_payload.items()}
             for name, by_payload in distilled.errors.items()
         }
+        # Keep them in the folder
         if file:
             entries = [entries_of(name, network) for name, network in zip(_NAMES, networks, strict=True)]
             told = {"key": np.asarray(key), "errors_json": np.asarray(json.dumps(errors))}

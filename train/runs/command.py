@@ -209,6 +209,7 @@ def export(
         run, file, keeps = Run.open(path), out, path
         check_policy(run)  # before the networks are distilled, which takes a minute
         held = run.held_pressures()
+        # A later calibration takes the place of the run's
         if calibration:
             options = ArmOptions(calibration=calibration)
             later = renewed(run, *options.read_arm(console))
