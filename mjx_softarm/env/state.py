@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_softarm.env.config import EnvConfig
+from mjx_softarm.env.config import EnvConfig, Randomisation
 from mjx_softarm.mechanics.motion.state import Motion, MotionParams, n_earlier
 from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.pneumatics import Regulator
@@ -78,8 +79,14 @@ class EpisodeMotion:
         # Commands that wait at a time, and those of an arm at rest; an arm that is always at rest needs none
         spread = 1.0 + self._spread.regulator_spread * self._regulated
         longest_s = spread * float(np.max(own.delay_s)) + self._spread.delay_max_s
-        self._n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.moves else 0
+        self.n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.moves else 0
         self._offset_kpa = self._actuators.rest_offset_kpa if config.moves else None
+
+    def spread_by(self, spread: Randomisation) -> EpisodeMotion:
+        """Return the same arms with another spread, whose numbers may be traced; as many commands wait."""
+        other = copy.copy(self)
+        other._spread = spread
+        return other
 
     def params(self, share: Array | None) -> MotionParams:
         """Return the parameters of an episode.
@@ -107,7 +114,7 @@ class EpisodeMotion:
         """Return the fields of `ArmState` that an equilibrium, a row of a pool, fixes."""
         rest = equilibrium.q, equilibrium.pressure_kpa, equilibrium.spring_m
         return {
-            "motion": Motion.at_rest(*rest, self._n_earlier, self._offset_kpa),
+            "motion": Motion.at_rest(*rest, self.n_earlier, self._offset_kpa),
             "pose": equilibrium.pose,
             "spring_m": equilibrium.spring_m,
             "pressure_kpa": equilibrium.pressure_kpa,

@@ -21,10 +21,12 @@ from jax import Array
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.env.state import EpisodeMotion
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.workspace import Pool
+from mjx_softarm.spec import ArmSpec
 from train.agent.registry import World, learner_of
-from train.config import TrainConfig
+from train.config import ConfigError, TrainConfig
 from train.epoch.job import Job, TrainState
 from train.epoch.poses import Poses
 
@@ -59,7 +61,27 @@ def with_env_config(env: ReachEnv, config: Any) -> ReachEnv:
     """Return the environment with a config that differs in `variable` settings alone."""
     other = copy.copy(env)
     other.config = config
+    other.episode_motion = env.episode_motion.spread_by(config.randomisation)
     return other
+
+
+def check_delays(spec: ArmSpec, configs: Sequence[TrainConfig]) -> None:
+    """Refuse members in motion whose longest dead times differ in whole control periods.
+
+    The commands that wait are part of the state, whose shapes the members share.
+
+    Raises:
+        ConfigError: they differ.
+    """
+    each = {EpisodeMotion(spec, config.env).n_earlier: config.env.randomisation for config in configs}
+    if len(each) > 1:
+        spreads = (
+            f"delay_max_s {x.delay_max_s:g}, regulator_spread {x.regulator_spread:g}" for x in each.values()
+        )
+        got = " and ".join(spreads)
+        period_s = 1.0 / spec.control.rate_hz
+        expected = f"dead times that end in the same control period of {period_s:g} s"
+        raise ConfigError(f"env.randomisation: got {got}, expected {expected}: train them one by one")
 
 
 class SweepJob:

@@ -24,7 +24,7 @@ from train.epoch.job import TrainState
 from train.runs.checkpoint import Run, RunError
 from train.runs.run import train_together
 from train.runs.task import Task, task_of
-from train.sweep.job import SweepJob, with_env_config
+from train.sweep.job import SweepJob, check_delays, with_env_config
 
 SWEEP_FILE = "sweep.json"
 
@@ -63,7 +63,9 @@ def create(
 
     Raises:
         RunError: there is such a folder already, or it cannot be made.
+        ConfigError: dead times of the members differ too much.
     """
+    check_delays(spec, list(members.values()))
     # Make the members' folders beside the final one, and rename the whole at the end.
     if path.exists():
         expected = f"a new folder; --resume {path} continues this one"

@@ -20,7 +20,7 @@ from train.runs.checkpoint import Run, RunError
 from train.runs.task import Task
 from train.sweep import run as sweep_run
 from train.sweep.command import members_of
-from train.sweep.job import SweepJob, setting, variable
+from train.sweep.job import SweepJob, setting, variable, with_env_config
 from train.sweep.report import CURVES_FILE, RESULTS_FILE, report
 from train.sweep.run import create, open_sweep
 
@@ -234,6 +234,29 @@ def test_members_are_the_product_of_seeds_and_values():
         "seed7-learner.gamma=0.5-env.reward.goal_bonus=50": (7, 0.5, 50.0, 64),
         "seed7-learner.gamma=0.9-env.reward.goal_bonus=50": (7, 0.9, 50.0, 64),
     }
+
+
+MOVING = dataclasses.replace(CONFIG, env=EnvConfig(mode="dynamic", n_poses=8))
+
+
+def test_a_member_in_motion_has_its_own_randomisation():
+    spreads = ["env.randomisation.damping_spread=0.2", "env.randomisation.friction_max_n=2.0"]
+    other = override(MOVING, [*spreads, "env.randomisation.delay_max_s=0.005"]).env
+    share = np.ones(3)
+    own, expected = (
+        env.episode_motion.params(share)
+        for env in (with_env_config(ReachEnv(SHORT, MOVING.env), other), ReachEnv(SHORT, other))
+    )
+    assert (own.damping, own.friction_n) == (1.2, 2.0) and own == expected
+
+
+def test_members_whose_commands_wait_for_other_times_are_refused(tmp_path):
+    members, varied = members_of(MOVING, (0,), ["env.randomisation.delay_max_s=0.0,0.05"])
+    with pytest.raises(
+        ConfigError, match="got delay_max_s 0, .* and delay_max_s 0.05, .* same control period"
+    ):
+        create(tmp_path / "sweep", members, varied, SHORT)
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
