@@ -1,66 +1,216 @@
-"""Calibrations of a rod, an arm of other physics, by random poses and by planned ones.
+"""Trained policies of rods, arms of other physics, by the poses of their calibration, in the closed loop.
 
-Both calibrations of an arm share their first poses, which are random. The others are random, or chosen by
-`calib.plan` from the calibration by the first ones. S2R is judged on random poses that neither has seen.
-Rods are logged at rest, without the motion from pose to pose.
+Recordings of a rod share their first poses, which are random. The others are chosen by `calib plan` from the
+calibration by the first ones, or random. The commands are those of `docs/calibrate.md`, but for recording: a
+pose is logged at rest, without the motion to it. A log of every tick tells the regulators. Nobody tells the
+loop what a rod carries.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
-from calib.fit.pose_errors import pose_errors
-from calib.fit.s2r import simulate_poses
-from calib.plan import plan
-from calib.read.static_poses import find_static_poses
-from calib.run import Calibration, calibrate
+from benchmarks.accuracy.arms import N_MOVING, run_command
+from benchmarks.harness.common import grouped, names_of, target
 from mjx_softarm._support import cli, xla
-from mjx_softarm.logs.schema import Log
+from mjx_softarm._support.provenance import write_json
+from mjx_softarm.deploy.accuracy.budget import budget
+from mjx_softarm.deploy.accuracy.measure import at_rest, figures, read_goals
+from mjx_softarm.deploy.accuracy.measure import measure as accuracy
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.ending import LoopRun
+from mjx_softarm.deploy.record import record
+from mjx_softarm.deploy.safety import PAYLOAD_FAULTS
+from mjx_softarm.deploy.session import follow
+from mjx_softarm.logs.pressure_plan import read_plan
+from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import correct
+from mjx_softarm.policy.file import load_policy
+from mjx_softarm.sensing.load import estimate_load, load_half_width
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import S2R_SESSION
 from mjx_softarm.twin.rod_twin import RodTwin
 
-N_FRAMES = 50  # averaged frames: a second
-TEST_SEED = 77
+N_FRAMES = 50  # averaged frames of a logged pose: a second
+FIRST, MORE_SEED, MOVING_SEED = 500, 1_000, 2_000  # random poses of all; seeds of other poses, plus the rod's
+RECORDINGS = {"random": "500 random", "planned": "500 random, 200 planned", "more": "700 random"}
+N_MORE = 200
+CIRCLE_MM = {0: 1.5, 500: 1.5, 1000: 2.0}  # targets by payload [g]: mean error on the circle
+BELIEVED_MM, PAYLOAD_G, HALF, QUARTER_OFF = 0.5, 60.0, 0.5, 0.75  # other targets
 
 
 def measure(
-    rods: cli.Integers = (0, 1), poses: int = 500, first: int = 100, tests: int = 300
+    rods: cli.Integers = (0, 1, 2),
+    recordings: Annotated[tuple[str, ...], names_of(RECORDINGS)] = tuple(RECORDINGS),
+    preset: str = "payload",
+    steps: int = 1_048_576,
+    points: int = 12,
+    keep: cli.MaybePath = None,
 ) -> dict[str, Any]:
-    """Do planned poses calibrate an arm better than random ones?
+    """What do planned and random poses do for payloads and for goals of an arm, in the closed loop?
 
     Args:
         rods: seeds of the rod twins
-        poses: number of poses of each calibration
-        first: number of random poses that both begin with
-        tests: number of random poses that judge
+        recordings: names of recordings
+        preset: of each training
+        steps: environment steps of each training
+        points: goals of the circle, and of the grid at most
+        keep: folder for logs, calibrations and runs, to go on with later; without one they are deleted
     """
     xla.enable_compilation_cache()
-    return {f"rod {seed}": _compare(seed, poses, first, tests) for seed in rods}
+    with tempfile.TemporaryDirectory() as folder:
+        home = (keep or Path(folder)).absolute()
+        settings = preset, steps, points
+        rows = [row for seed in rods for name in recordings for row in _rows(seed, name, home, settings)]
+    return {"targets": targets(rows), "rods": rows}
 
 
-def _compare(seed: int, poses: int, first: int, tests: int) -> dict[str, Any]:
-    # The rod, and random poses that judge.
-    spec = ArmSpec.default()
-    arm = RodTwin(seed, spec, session=S2R_SESSION)
-    judge = log_at_rest(arm, random_pressures(spec, tests, TEST_SEED))
-    # By random poses.
-    pressure_kpa = random_pressures(spec, poses, seed)
-    random = _figures(calibrate([log_at_rest(arm, pressure_kpa)], spec), judge)
-    print(f"rod {seed}: random {random}", flush=True)
-    # By the first of them, and planned ones.
-    logs = [log_at_rest(arm, pressure_kpa[:first])]
-    known = calibrate(logs, spec)
-    assert known.recorded is not None  # as there are poses
-    logs.append(
-        log_at_rest(arm, plan(known.spec, known.recorded, poses - first, seed, known.held).pressure_kpa)
-    )
-    return {"random": random, "planned": _figures(calibrate(logs, spec), judge)}
+def targets(rows: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
+    """Return the targets of each recording over its rods, then those of planned poses beside random ones."""
+    found, sizes = [], {}
+    for (name,), group in grouped(rows, ("recording",)).items():
+        # The circle, and what the loop believes there
+        circle = [row for row in group if row["goals"] == "circle"]
+        for payload_g, most_mm in CIRCLE_MM.items():
+            mm = [row["mean [mm]"] for row in circle if row["payload [g]"] == payload_g]
+            text = f"{name}: circle {most_mm} mm with {payload_g} g, over the rods"
+            found.append(target(text, f"{np.mean(mm):.2f} mm", bool(np.mean(mm) <= most_mm)))
+        off_mm = max(abs(row["believed [mm]"] - row["mean [mm]"]) for row in circle)
+        text = f"{name}: believed error within {BELIEVED_MM} mm of the true one"
+        found.append(target(text, f"{off_mm:.2f} mm at most", off_mm <= BELIEVED_MM))
+        # The payload, by the mean of a circle
+        held = [row["interval of the mean holds it"] for row in circle]
+        text = f"{name}: 95 % of the intervals hold the payload"
+        found.append(target(text, f"{np.mean(held):.0%}", bool(np.mean(held) >= 0.95)))
+        off_g = [abs(row["told [g]"] - row["payload [g]"]) for row in circle]
+        if name == RECORDINGS["planned"]:
+            text = f"{name}: payload within {PAYLOAD_G:g} g"
+            found.append(target(text, f"{max(off_g):.0f} g at most", max(off_g) <= PAYLOAD_G))
+            unknown = max(row["unknown directions"] for row in group)
+            found.append(target(f"{name}: no unknown direction", f"{unknown} at most", unknown == 0))
+        grid_mm = [row["largest [mm]"] for row in group if row["goals"] == "grid"]
+        sizes[name] = {row["rod"] for row in group}, float(np.mean(off_g)), float(np.mean(grid_mm))
+
+    # Planned poses beside the first ones, on the same rods
+    first, then = (sizes.get(RECORDINGS[name]) for name in ("random", "planned"))
+    if first and then and first[0] == then[0]:
+        for text, k, share, unit in (
+            ("planned poses halve the payload's error", 1, HALF, "g"),
+            ("planned poses lower the largest error on the grid by a quarter", 2, QUARTER_OFF, "mm"),
+        ):
+            measured = f"from {first[k]:.3g} to {then[k]:.3g} {unit}"
+            found.append(target(text, measured, then[k] <= share * first[k]))
+    return found
+
+
+def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> list[dict[str, Any]]:
+    """Return the rows of a rod with a recording; take them from their file if it is there."""
+    preset, steps, points = settings
+    folder = _calibrated(seed, name, home)
+    run, file = folder / f"{preset}-{steps}", folder / f"{preset}-{steps}-{points}.json"
+    if file.exists():
+        return json.loads(file.read_text("utf-8"))
+
+    # Train and export
+    policy = run / "policy.npz"
+    if not (run / "evaluation.json").exists():
+        options = ("--calibration", folder / "calibration", "--learner.total-env-steps", steps)
+        anew = ("--preset", preset, *options, "--seed", 0, "--out", run)
+        arguments = ("--resume", run) if (run / "config.json").exists() else anew
+        run_command("train", "reach", *arguments, makes=run / "evaluation.json")
+    if not policy.exists():
+        run_command("train", "export", run, makes=policy)
+
+    # The closed loop, on the circle with payloads and on the grid
+    controller = Controller.of(load_policy(policy))
+    report = json.loads((folder / "calibration/report.json").read_text("utf-8"))["parts"]
+    shared = {
+        "rod": seed,
+        "recording": RECORDINGS[name],
+        "unknown directions": len(report["Chambers"]["figures"]["weak"]),
+        "S2R, held out [mm]": report["Sim-to-real network"]["figures"]["test"]["translation_mean_mm"],
+    }
+    rows = []
+    for goals, payload_g in [("circle", g) for g in CIRCLE_MM] + [("grid", 0)]:
+        poses = read_goals(goals, controller.policy, points)
+        arm = RodTwin(seed, payload_kg=1e-3 * payload_g)
+        run_to_end = follow(arm, controller, list(poses))
+        row = shared | {"goals": goals, "payload [g]": payload_g}
+        rows.append(row | of_run(run_to_end, controller, poses, payload_g))
+        print(rows[-1], flush=True)
+    write_json(file, rows)
+    return rows
+
+
+def of_run(run: LoopRun, controller: Controller, goals: np.ndarray, payload_g: float) -> dict[str, Any]:
+    """Return the errors of a run, what made them, and the payload that was told, with its interval."""
+    policy, found = controller.policy, accuracy(run, controller, goals)
+    told = figures(found, run.counts(), policy.reward.asked)
+    parts = budget(run, controller, 1e-3 * payload_g)
+    assert run.log.pressure_kpa is not None  # as the loop logs it
+
+    # Payloads of each arrival alone, by the network; the loop averages them
+    networks, each_g = (estimate_load, load_half_width), []
+    for arrival in run.arrivals:
+        rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
+        means = at_rest(run, controller, arrival).spring_m, run.log.pressure_kpa[rows].mean(axis=0)
+        each_g.append([1e3 * float(network(policy.load_estimator, *means)) for network in networks])
+    kg, half_width = np.array(each_g).T
+    return {
+        "measured": told["measured"],
+        "mean [mm]": told["translation_mm"],
+        "largest [mm]": told["max_mm"],
+        "believed [mm]": told["believed_mm"],
+        "saturated": told["saturated_points"],
+        "told [g]": float(kg.mean()),
+        "half-width [g]": float(half_width.mean()),
+        "interval of the mean holds it": bool(abs(kg.mean() - payload_g) <= half_width.mean()),
+        "believed [g]": told["load_estimate_g"],
+        "payload faults": sum(run.counts().get(fault, 0) for fault in PAYLOAD_FAULTS),
+        **{f"by {name} [mm]": mm for name, mm in (parts.parts_mm if parts else {}).items()},
+    }
+
+
+def _calibrated(seed: int, name: str, home: Path) -> Path:
+    """Return the folder of a rod's recording and calibration; make both if they are not there."""
+    first, folder = home / f"rod{seed}-random", home / f"rod{seed}-{name}"
+    calibration = folder / "calibration"
+    if calibration.exists():
+        return folder
+    folder.mkdir(parents=True, exist_ok=True)
+    spec, poses = ArmSpec.default(), first / "poses.npz"
+    logs = [poses, first / "moving.npz"]
+    if name == "random":
+        # Random poses, and the way between a few
+        if not poses.exists():
+            arm = RodTwin(seed, session=S2R_SESSION)
+            write_log(poses, log_at_rest(arm, random_pressures(spec, FIRST, seed)))
+        moving_kpa = random_pressures(spec, N_MOVING, seed + MOVING_SEED)
+        record(
+            RodTwin(seed, session=S2R_SESSION),
+            spec,
+            moving_kpa,
+            transients=True,
+            save=lambda log: write_log(logs[1], log),
+        )
+    else:
+        # More poses, of a plan or random
+        known, table = _calibrated(seed, "random", home) / "calibration", folder / "next.csv"
+        if name == "planned":
+            run_command("calib", "plan", known, "--poses", N_MORE, "--out", table, makes=table)
+            more_kpa = read_plan(table, spec)
+        else:
+            more_kpa = random_pressures(spec, N_MORE, seed + MORE_SEED)
+        logs.append(folder / "more.npz")
+        write_log(logs[-1], log_at_rest(RodTwin(seed, session=S2R_SESSION), more_kpa))
+    run_command("calib", "run", *logs, "--out", calibration, makes=calibration / "report.json")
+    return folder
 
 
 def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
@@ -85,27 +235,3 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
     columns: Any = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     kg = np.zeros(n)
     return Log(source="rod", row=np.arange(n) + 2, time_s=5.0 * np.arange(n), payload_kg=kg, **columns)
-
-
-def _figures(calibration: Calibration, judge: Log) -> dict[str, Any]:
-    """Return figures of a calibration's report, and the errors of S2R at poses that it has not seen."""
-    # Simulate the poses that judge, and correct them by the network.
-    spec = calibration.spec
-    parts = {section.title: section for section in calibration.sections}
-    chambers, network = parts["Chambers"].data, parts["Sim-to-real network"].data
-    poses = find_static_poses([judge], spec)[0].with_lengths(spec)
-    simulated = simulate_poses(spec, poses.spring_m)
-    real = pose_from_frame(poses.tip_m, poses.tip_rotation)
-    pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
-    corrected = pose if calibration.s2r is None else correct(calibration.s2r, pose, spring_m)
-    # Compare both with the measured poses.
-    before, after = pose_errors(pose, real), pose_errors(corrected, real)
-    return {
-        "unknown directions": len(chambers["weak"]),
-        "least known direction [tolerances]": float(np.max(chambers["direction_widths"])),
-        "S2R, its training [mm]": network["in_sample"]["translation_mean_mm"],
-        "S2R, its held-out poses [mm]": network["test"]["translation_mean_mm"],
-        "without S2R, random poses [mm]": before.translation_mean_mm,
-        "S2R, random poses [mm]": after.translation_mean_mm,
-        "warnings": sum(len(section.warnings) for section in calibration.sections),
-    }
