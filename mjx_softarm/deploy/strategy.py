@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.control import at_chambers
+from mjx_softarm.control import allocated_error
 from mjx_softarm.deploy.belief import Belief, pose_of
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
@@ -251,16 +251,19 @@ def _extrapolated(belief: Belief) -> tuple[Event, ...]:
 
 def _unsettled(belief: Belief) -> tuple[Event, ...]:
     """Return the faults of the springs as they stand before the next action."""
-    off_m, mask, events = belief.mean_m - belief.command.reference_m, belief.saturated, []
+    # Errors at the chambers: springs of an arm with redundant chambers cannot all be on any references
+    controller, command, mask, events = belief.controller, belief.command, belief.saturated, []
+    off_m, allocation = belief.mean_m - command.reference_m, controller.policy.gains.allocation
+    if allocation is not None:
+        off_m = -allocated_error(-off_m, command.pressure_kpa, allocation)
+
     if not belief.settled:
-        beside = mask[:: len(mask) // len(off_m)]  # saturation of the chamber beside each spring
-        worst = int(np.argmax(np.where(beside, 0.0, np.abs(off_m))))
-        waited_s = belief.controller.config.settle_timeout_s
-        text = f"after {waited_s:g} s, spring{worst} is {1e3 * off_m[worst]:+.1f} mm"
+        worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
+        where = f"{'spring' if allocation is None else 'chamber'}{worst}"
+        text = f"after {controller.config.settle_timeout_s:g} s, {where} is {1e3 * off_m[worst]:+.1f} mm"
         events.append(Event(Fault.NOT_SETTLED, f"{text} off its reference"))
     if mask.any():
-        own_m = at_chambers(off_m, belief.controller.policy.gains.allocation)
-        off = ", ".join(f"{1e3 * value:+.1f}" for value in own_m[mask])
+        off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
         text = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
         events.append(Event(Fault.SATURATED, text))
     return tuple(events)
