@@ -13,7 +13,7 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -105,12 +105,17 @@ def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
     """
     entries: dict[str, Any] = {}
     for item in _field_names(type(group)):
-        value, network = getattr(group, item), item.removesuffix("layers")
-        if network != item:
-            entries |= layer_entries(f"{name}.{network}".rstrip("._"), value)
+        value = getattr(group, item)
+        if item.endswith("layers"):
+            entries |= layer_entries(_network_name(name, item), value)
         else:
             entries[f"{name}.{item}"] = value
     return {item: np.asarray(value) for item, value in entries.items()}
+
+
+def _network_name(name: str, item: str) -> str:
+    """Return the name of the layers of a field `layers` or `x_layers`."""
+    return f"{name}.{item.removesuffix('layers')}".rstrip("._")
 
 
 def _field_names(kind: type) -> tuple[str, ...]:
@@ -175,18 +180,24 @@ class Entries:
         return tuple(layers)
 
     def network(
-        self, name: str, kind: Callable[..., Any], shapes: Mapping, n_inputs: int, n_outputs: int
+        self, name: str, kind: type, widths: Mapping[str, tuple[int, int]], shapes: Mapping[str, tuple]
     ) -> Any:
-        """Return a named tuple with float32 arrays in the `shapes` of its fields, and with `layers`.
+        """Return a named tuple of networks and of float32 arrays, as `entries_of` stored it.
 
-        A field with `_scale` in its name must be greater than 0.
+        Args:
+            name: name of the group.
+            kind: class of the tuple.
+            widths: numbers of inputs and outputs of each field `layers` or `x_layers`.
+            shapes: shape of each other field; numbers of a field with `_scale` in its name must be > 0.
         """
-        values = {}
+        values: dict[str, Any] = {}
         for item, shape in shapes.items():
             value = values[item] = np.asarray(self.take(f"{name}.{item}", np.float32, shape), np.float32)
             if "_scale" in item and not (value > 0.0).all():
                 self.fail(f"{name}.{item}", f"got {value.tolist()}, expected numbers > 0")
-        return kind(**values, layers=self.layers(name, n_inputs, n_outputs))
+        for item, (n_inputs, n_outputs) in widths.items():
+            values[item] = self.layers(_network_name(name, item), n_inputs, n_outputs)
+        return kind(**values)
 
     def finish(self, schema: int) -> None:
         """Refuse entries that nobody took."""

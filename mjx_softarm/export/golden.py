@@ -55,7 +55,7 @@ class Golden(NamedTuple):
 
     @property
     def n_chambers(self) -> int:
-        return self.about.get("n_chambers", self.about["n"])  # missing in older files
+        return self.about["n_chambers"]
 
     def input_columns(self) -> list[str]:
         """Return the names of a row's inputs."""

@@ -30,8 +30,7 @@ float64, networks and the workspace float32.
 
 The arm's numbers stand beside `spec_json` because the actor was trained with them: a later version may derive
 others from the same specification. A new entry, or a new field of a class named here (`ArmSpec` included),
-makes a new schema: raise `SCHEMA_VERSION`. Files of the `READABLE` schemas are read; a file of another one is
-refused: its run is exported again.
+makes a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused: its run is exported again.
 """
 
 from __future__ import annotations
@@ -54,23 +53,13 @@ from mjx_softarm.mdp.observation import Observation, ObsScale, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.networks import take_networks
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel
-from mjx_softarm.sensing.load import QUANTILE, LoadEstimator
+from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 from mjx_softarm.spec_tables import Mounting
 
 SCHEMA_VERSION = 10
-READABLE = (7, 8, 9, 10)
-# In 7, `estimator.spring_site_m` is (n, 2), each section has as many chambers as springs, and the arm hangs
-ADDED_IN_8 = {"reward.axes": np.ones(6)} | {
-    f"estimator.{name}": PoseEstimator._field_defaults[name] for name in ("base_position_m", "base_rotation")
-}
-ADDED_IN_9 = {"s2r.error_mm": S2R._field_defaults["error_mm"]}
-
-# Before 10, the error of the payload was not estimated: it was an overload from 1.4 largest payloads.
-OLD_LOAD_SD = 0.2 / QUANTILE  # largest payloads
-
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
@@ -183,13 +172,6 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
-def _unknown_error(n_inputs: int) -> dict[str, np.ndarray]:
-    """Return the entries of a network from n inputs to the constant `OLD_LOAD_SD`."""
-    weight, bias = np.zeros((n_inputs, 1), np.float32), np.full(1, np.log(OLD_LOAD_SD), np.float32)
-    entries = archive.layer_entries("load_estimator.sd", ((weight, bias),))
-    return {name: np.asarray(value) for name, value in entries.items()}
-
-
 def _take_reward(entries: Entries) -> RewardConfig:
     """Take the weights of the reward, checked."""
     names = [item.name for item in dataclasses.fields(RewardConfig) if item.name != "axes"]
@@ -198,19 +180,12 @@ def _take_reward(entries: Entries) -> RewardConfig:
 
 
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
-    # Refuse other schemas first, since their entries may differ.
-    version = Entries(arrays, source).take("schema_version", np.integer, ())
-    if version < SCHEMA_VERSION:
-        added = ADDED_IN_9 if version < 9 and arrays.get("s2r_kind") == "mlp" else {}
-        added = (ADDED_IN_8 if version < 8 else {}) | added
-        arrays = added | _unknown_error(len(arrays.get("load_estimator.0.weight", ()))) | dict(arrays)
+    # Refuse other schemas first, since their entries differ.
     entries = Entries(arrays, source)
-    entries.take("schema_version", np.integer, ())
-    if version not in READABLE:
-        readable = " or ".join(map(str, READABLE))
-        entries.fail(
-            "schema_version", f"got {version}, expected {readable}: export the run again, or train it anew"
-        )
+    version = entries.take("schema_version", np.integer, ())
+    if version != SCHEMA_VERSION:
+        expected = f"expected {SCHEMA_VERSION}: export the run again, or train it anew"
+        entries.fail("schema_version", f"got {version}, {expected}")
     try:
         spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
     except SpecError as error:

@@ -12,7 +12,6 @@ The control loop compares them with the readings to find a chamber that has lost
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -208,18 +207,13 @@ def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int)
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
-    shapes |= {"change_scale": (N_CHANGES,), "base_position_m": (3,), "base_rotation": (3, 3)}
-    shapes |= dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
     n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
-    own = {
-        # Older files have one axis for the springs of all sections.
-        "spring_site_m": entries.take(
-            f"{name}.spring_site_m", np.float32, (n_sections, n_springs // n_sections, 2), (n_springs, 2)
-        ).reshape(n_sections, -1, 2),
-        "load_layers": entries.layers(f"{name}.load", n_in + 1, n_out),
-    }
-    return entries.network(name, partial(PoseEstimator, **own), shapes, n_in, n_out)
+    shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
+    shapes |= dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
+    shapes |= {"spring_site_m": (n_sections, n_springs // n_sections, 2), "change_scale": (N_CHANGES,)}
+    shapes |= {"base_position_m": (3,), "base_rotation": (3, 3)}
+    widths = {"load_layers": (n_in + 1, n_out), "layers": (n_in, n_out)}
+    return entries.network(name, PoseEstimator, widths, shapes)
 
 
 def take_spring_model(entries: Entries, name: str, n_chambers: int, n_springs: int) -> SpringModel:
@@ -230,4 +224,4 @@ def take_spring_model(entries: Entries, name: str, n_chambers: int, n_springs: i
     """
     shapes = dict.fromkeys(("pressure_centre_kpa", "pressure_scale_kpa"), (n_chambers,))
     shapes |= dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
-    return entries.network(name, SpringModel, shapes, n_chambers, n_springs)
+    return entries.network(name, SpringModel, {"layers": (n_chambers, n_springs)}, shapes)

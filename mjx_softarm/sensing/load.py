@@ -10,7 +10,6 @@ an average is taken to be known no better than its estimates.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 from mjx_softarm._support.archive import Entries
@@ -101,6 +100,5 @@ def take_load_estimator(entries: Entries, name: str, n_chambers: int, n_springs:
     shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
     shapes |= dict.fromkeys(("pressure_centre_kpa", "pressure_scale_kpa"), (n_chambers,))
     shapes["load_scale_kg"] = ()
-    n_in = n_springs + n_chambers
-    kind = partial(LoadEstimator, sd_layers=entries.layers(f"{name}.sd", n_in, 1))
-    return entries.network(name, kind, shapes, n_in, 1)
+    widths = dict.fromkeys(("sd_layers", "layers"), (n_springs + n_chambers, 1))
+    return entries.network(name, LoadEstimator, widths, shapes)

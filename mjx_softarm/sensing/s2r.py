@@ -39,9 +39,7 @@ class S2R(NamedTuple):
     output_high: Array  # (n_out,) greatest corrections of the training rows
     anchors: Array  # (n_anchors, n_in) normalised training rows that represent all of them
     limit: Array  # () greatest believable distance to the nearest anchor
-    error_mm: Array = np.float32(
-        0.0
-    )  # () mean error of the tip at held-out poses; 0 in older files: not known
+    error_mm: Array = np.float32(0.0)  # () mean error of the tip at held-out poses; 0: not known
 
 
 def correct(s2r: S2R, pose: Array, spring_m: Array) -> Array:
@@ -174,7 +172,7 @@ def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
     shapes: dict = dict.fromkeys(("input_low", "input_high"), (n_in,))
     shapes |= dict.fromkeys(("output_low", "output_high"), (n_out,))
     shapes |= {"anchors": (None, n_in), "limit": (), "error_mm": ()}
-    s2r = entries.network(name, S2R, shapes, n_in, n_out)
+    s2r = entries.network(name, S2R, {"layers": (n_in, n_out)}, shapes)
     for item, holds, expected in (
         ("input_high", s2r.input_low < s2r.input_high, "more than input_low"),
         ("output_high", s2r.output_low <= s2r.output_high, "at least output_low"),
@@ -187,7 +185,7 @@ def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
 
 
 def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int) -> S2R:
-    entries = Entries({f"{KIND}.error_mm": S2R._field_defaults["error_mm"]} | arrays, source)  # older files
+    entries = Entries(arrays, source)
     s2r = take_s2r(entries, KIND, n_springs)
     entries.finish(1)
     return s2r

@@ -20,7 +20,6 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.actor import policy_from_actor
 from mjx_softarm.policy.file import load_policy, save_policy
-from mjx_softarm.sensing.load import load_half_width
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
@@ -113,33 +112,6 @@ def test_file_is_plain_npz_with_named_layouts(file):
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
 
 
-def test_file_of_schema_7_is_read(file):
-    """The springs of all sections had one axis."""
-    site_m = arrays_of(file)["estimator.spring_site_m"]
-    reseal(file, drop=("s2r.error_mm",), schema_version=np.asarray(8))
-    policy = load_policy(file)
-    reseal(file, schema_version=np.asarray(7), **{"estimator.spring_site_m": site_m.reshape(9, 2)})
-    assert_same(load_policy(file), policy)
-
-
-def test_file_of_schema_8_does_not_know_the_error_of_its_network(file):
-    policy = load_policy(file)
-    reseal(file, drop=("s2r.error_mm",), schema_version=np.asarray(8))
-    s2r = policy.s2r._replace(error_mm=np.float32(0))
-    model = load_policy(file).load_estimator
-    assert_same(load_policy(file), dataclasses.replace(policy, s2r=s2r, load_estimator=model))
-
-
-def test_file_of_schema_9_knows_each_payload_alike(file):
-    policy, errors = load_policy(file), [name for name in arrays_of(file) if ".sd." in name]
-    reseal(file, drop=errors, schema_version=np.asarray(9))
-    nine = load_policy(file)
-    half_width_kg = load_half_width(nine.load_estimator, np.full((2, 9), 0.2), np.zeros((2, 9)))
-    np.testing.assert_allclose(half_width_kg, 0.2 * policy.load_estimator.load_scale_kg, rtol=1e-6)
-    model = nine.load_estimator._replace(sd_layers=policy.load_estimator.sd_layers)
-    assert_same(dataclasses.replace(nine, load_estimator=model), policy)
-
-
 def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model):
     policy = policy_from_actor(
         make_params((), 6), TWO_SECTIONS, RewardConfig(), make_arm_model(TWO_SECTIONS), {}
@@ -224,9 +196,8 @@ def test_files_that_are_no_policy(tmp_path):
 
 
 def test_another_schema_is_named_before_anything_else(file):
-    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(6))
-    expected = "expected 7 or 8 or 9 or 10: export the run again, or train it anew"
-    assert refusal(file) == f"schema_version: got 6, {expected}"
+    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(9))
+    assert refusal(file) == "schema_version: got 9, expected 10: export the run again, or train it anew"
 
 
 def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file):
