@@ -28,7 +28,7 @@ from mjx_softarm.deploy.accuracy.measure import (
     write_accuracy,
 )
 from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
-from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.drivers.driven import Arms, finish
 from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
 from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
@@ -101,7 +101,7 @@ def _run(
         raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
-    controller = _controller(policy)
+    controller = _controller(policy, go_on)
     goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
     driver = on.open(controller.policy.spec, tell)
@@ -110,7 +110,7 @@ def _run(
     # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
-    run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay, go_on=go_on)
+    run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver, tell)
@@ -118,10 +118,10 @@ def _run(
     return run.status
 
 
-def _controller(policy: Path) -> Controller:
+def _controller(policy: Path, go_on: bool) -> Controller:
     if policy == SHIPPED:
         tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
-    return Controller.of(load_policy(policy))
+    return Controller.of(load_policy(policy), config=replace(LOOP, go_on=go_on))
 
 
 def _measure(
@@ -154,7 +154,7 @@ def _measure(
         )
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
-    controller = _controller(policy)
+    controller = _controller(policy, go_on)
     poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
@@ -170,7 +170,7 @@ def _measure(
         save_log(out / "log.npz", replace(log, payload_kg=np.full(len(log), payload_kg)))
 
     if seconds is None:
-        run = follow(driver, controller, poses, tell=tell, save=save, go_on=go_on)
+        run = follow(driver, controller, poses, tell=tell, save=save)
     else:
         pace_s = seconds / max(len(poses) - 1, 1)
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)

@@ -68,6 +68,7 @@ class LoopConfig:
     # Windows in a row; by hand. Springs and pressures of an arm that moves come after their references.
     rest_windows: int = 2
     moving_windows: int = 6
+    go_on: bool = False  # go on without the first lost chamber (`mjx_softarm.deploy.lost`) instead of venting
 
     @property
     def shift_limit(self) -> np.ndarray:
@@ -122,7 +123,7 @@ class Controller:
 
     @property
     def way_rule(self) -> WayRule:
-        """Numbers by which the error on the way of a moving goal is made up for."""
+        """Numbers by which `WayError` corrects a moving goal."""
         config = self.config
         return WayRule(
             self.policy.reward, self.dt_s, self.lead_s, config.way_share_per_s, config.max_shift[0]

@@ -1,8 +1,8 @@
 """A run that goes on without a chamber that has lost its pressure.
 
-The chamber is kept at zero. The policy's actor knows arms with all chambers only. So references come of a
-search over the other chambers' pressures, in the policy's models (`mjx_softarm.policy.reach`). It takes
-longer than a tick: a goal is searched for over some ticks, in which the arm holds its references, before it
+The chamber is kept at zero. The policy's actor only knows arms with all chambers. References therefore come
+from a search over the other chambers' pressures in the policy's models (`mjx_softarm.policy.reach`). A search
+takes longer than a tick. It is spread over some ticks, in which the arm holds its references, before the goal
 is taken. Estimates of the pose need springs alone, and stay as they are.
 """
 
@@ -58,13 +58,16 @@ class GoalSearch:
 
 
 def without(controller: Controller, lost: np.ndarray) -> tuple[Controller, GoalSearch]:
-    """Return the controller of an arm whose lost chambers (n_chambers,) have no pressure, and its search."""
+    """Return the controller of an arm whose lost chambers (n_chambers,) have no pressure, and its search.
+
+    A second lost chamber ends the run.
+    """
     gains = controller.policy.gains
     low_kpa, high_kpa = (np.where(lost, 0.0, x) for x in (gains.pressure_min_kpa, gains.pressure_max_kpa))
     gains = gains._replace(pressure_min_kpa=low_kpa, pressure_max_kpa=high_kpa)
     policy = dataclasses.replace(controller.policy, gains=gains)
-    search = GoalSearch(policy)
-    return dataclasses.replace(controller, policy=policy, plan=search.plan), search
+    config, search = dataclasses.replace(controller.config, go_on=False), GoalSearch(policy)
+    return dataclasses.replace(controller, policy=policy, plan=search.plan, config=config), search
 
 
 def begun_again(controller: Controller, state: LoopState) -> LoopState:

@@ -38,7 +38,6 @@ def follow(
     arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
     stay: bool = False,
-    go_on: bool = False,
 ) -> LoopRun:
     """Bring the tip to goals, one after the other, then vent; `vent_at_end` says what else ends a run.
 
@@ -51,12 +50,11 @@ def follow(
         arrived: takes the index of each goal arrived at, as the arm rests there; a gripper may act.
         save: writes the log, once the arm is vented.
         stay: hold the last goal until `duration_s` or something else ends the run.
-        go_on: go on without the first chamber that loses its pressure, by `mjx_softarm.deploy.lost`.
     """
     goals = list(goals)
     refused = refusals(controller.policy, goals)  # before the arm moves: it takes longer than a tick
     source = ListedGoals(controller, goals, refused, duration_s, stay)
-    return _Session(arm, controller, source, tell, arrived, go_on=go_on).to_end(save)
+    return _Session(arm, controller, source, tell, arrived).to_end(save)
 
 
 def trace(
@@ -112,10 +110,9 @@ class _Session:
         arrived: Callable[[int], None] = lambda goal: None,
         look: Callable[[LoopState, Tick, dict[str, Any]], None] = lambda state, tick, row: None,
         kept: int | None = None,
-        go_on: bool = False,
     ):
         self.controller, self.goals = controller, goals
-        self.tell, self.arrived, self.look, self.may_go_on = tell, arrived, look, go_on
+        self.tell, self.arrived, self.look = tell, arrived, look
         self.state = start(controller)
         self.nothing = np.full(controller.policy.spec.n_springs, np.nan)
         self.link, self.rows = Link(arm, controller.policy.spec, controller.dt_s), Recorder(kept)
@@ -194,15 +191,15 @@ class _Session:
         return in_time
 
     def _goes_on(self, stop: Event) -> bool:
-        """Go on without the chamber that was lost, if the run may and it is the first one."""
-        if not self.may_go_on or stop.fault is not Fault.CHAMBER_LOST:
+        """Go on without the chamber that was lost, if the controller may and goals stand still."""
+        goals, may = self.goals, self.controller.config.go_on and stop.fault is Fault.CHAMBER_LOST
+        if not may or not isinstance(goals, ListedGoals):
             return False
-        assert isinstance(self.goals, ListedGoals)
         lost = lost_chambers(self.controller, self.state.watch, self.state.belief)
         self.tell(self._at(f"{stop.fault.value}: {stop.message} -> go on without {names('chamber', lost)}"))
         self.controller, search = without(self.controller, lost)
         again = begun_again(self.controller, self.state)
-        self.state, self.may_go_on = self.goals.go_on(self.controller, search, again), False
+        self.state = goals.go_on(self.controller, search, again)
         return True
 
     def _log(self, row: dict[str, Any]) -> None:

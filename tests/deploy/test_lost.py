@@ -2,6 +2,7 @@
 
 import warnings
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from tests.linear_arm import (
     go,
 )
 
+GOES_ON = replace(CONTROLLER, config=replace(CONTROLLER.config, go_on=True))
 LOST = np.arange(N) == 3  # the chamber that leaks
 OTHERS_KPA = np.where(LOST, 0.0, PRESSURES_KPA)
 POSSIBLE = estimate(POLICY.estimator, REST_M + OTHERS_KPA @ GAIN_M_PER_KPA.T, 0.0).astype(float)
@@ -35,7 +37,7 @@ def test_a_run_goes_on_without_the_chamber_that_was_lost():
     lines, arm = [], Leaking(150)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run = go(arm, goals=[GOALS[0], *POSSIBLE], tell=lines.append, go_on=True)
+        run = go(arm, goals=[GOALS[0], *POSSIBLE], tell=lines.append, controller=GOES_ON)
     assert run.counts()[Fault.CHAMBER_LOST] == 1
     [line] = [line for line in lines if "go on without" in line]
     assert line.endswith("lie as they would without that -> go on without chamber3")
@@ -59,7 +61,7 @@ class Bursting(Leaking):
 
 
 def test_a_second_chamber_ends_the_run():
-    run = go(Bursting(150), goals=[GOALS[0], *np.tile(POSSIBLE, (40, 1))], go_on=True)
+    run = go(Bursting(150), goals=[GOALS[0], *np.tile(POSSIBLE, (40, 1))], controller=GOES_ON)
     assert run.counts()[Fault.CHAMBER_LOST] == 2 and run.ending.status == FAULT
     assert "chamber5" in run.ending.cause
 
@@ -67,7 +69,7 @@ def test_a_second_chamber_ends_the_run():
 def test_goals_that_the_other_chambers_do_not_reach_are_refused():
     long = estimate(POLICY.estimator, REST_M + GAIN_M_PER_KPA @ np.full(N, 19.0), 0.0).astype(float)
     assert not refusals(POLICY, [long]) and refusals(without(CONTROLLER, LOST)[0].policy, [long])
-    run = go(Leaking(150), goals=[GOALS[0], long, POSSIBLE[0]], go_on=True)
+    run = go(Leaking(150), goals=[GOALS[0], long, POSSIBLE[0]], controller=GOES_ON)
     assert run.counts()[Fault.GOAL_OUTSIDE] >= 1 and 1 not in {arrival.index for arrival in run.arrivals}
     assert run.arrivals[-1].reached
 
@@ -102,7 +104,7 @@ def test_a_tick_has_at_most_one_step_of_a_search_besides_those_of_an_action(monk
         return improve(policy, goal, search)
 
     monkeypatch.setattr(lost, "improve", counted)
-    run = go(arm, goals=[GOALS[0], *POSSIBLE], go_on=True)
+    run = go(arm, goals=[GOALS[0], *POSSIBLE], controller=GOES_ON)
     assert run.ending.status == DONE and {arrival.index for arrival in run.arrivals} >= {1, 2}
     searched = [n for (_, rows), n in steps.items() if rows == N_STARTS]
     assert len(searched) >= 3 * N_STEPS and max(searched) == 1
