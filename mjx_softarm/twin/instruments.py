@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,8 +24,6 @@ SPRING_NOISE_M = 2**0.5 * CAPTURE_NOISE_M  # noise of the distance between two m
 PRESSURE_TOLERANCE_KPA = 1e-3  # tolerance beyond the limits, for rounding to float32
 MARKERS_PER_SECTION = 3
 WIDEST_DRAW = 2.0  # largest deviation of a part, in standard deviations; a worse part is not mounted
-
-
 GAP = 1.9  # scale of the tolerances; the modules of the twins say how it was set
 
 
@@ -48,6 +46,29 @@ AGED = Build(zero_m=1e-3, softening=0.05)  # the same arm, some months after its
 def drawn(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray:
     """Draw deviations of parts by their standard deviation; parts beyond `WIDEST_DRAW` are clipped to it."""
     return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
+
+
+def length_ratio(spec: ArmSpec) -> float:
+    """Return the mean length of an arm's sections over that of the paper's arm."""
+    paper = ArmSpec.default()
+    return float(np.mean(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m))
+
+
+def scaled_tolerances(tolerances: Any, gap: float, spec: ArmSpec, **factors: np.ndarray) -> Any:
+    """Return tolerances of an arm: times the gap; lengths in proportion to the arm's, others times `factors`.
+
+    Args:
+        tolerances: a dataclass of the paper's arm's; names of lengths end in `_m`.
+        gap: scale of all.
+        spec: the arm.
+        factors: factors by the names of fields that are no lengths.
+    """
+    length = length_ratio(spec)
+    scaled = {
+        name: gap * x * (length if name.endswith("_m") else factors.get(name, 1.0))
+        for name, x in dataclasses.asdict(tolerances).items()
+    }
+    return dataclasses.replace(tolerances, **scaled)
 
 
 class InstrumentedArm(abc.ABC):

@@ -28,7 +28,7 @@ from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.twin.instruments import Build, drawn
+from mjx_softarm.twin.instruments import Build, drawn, scaled_tolerances
 from mjx_softarm.twin.pipe import add_pipe
 
 LINKS_PER_SECTION = 10
@@ -75,14 +75,7 @@ class Parts(NamedTuple):
 
 def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     """Draw the parts of a twin from its seed; they do not depend on the scales of noise and losses."""
-    rng = np.random.default_rng(seed)
-    length = length_ratio(spec)
-    std = Tolerances(
-        **{
-            name: build.gap * x * (length if name.endswith("_m") else 1.0)
-            for name, x in dataclasses.asdict(Tolerances()).items()
-        }
-    )
+    rng, std = np.random.default_rng(seed), scaled_tolerances(Tolerances(), build.gap, spec)
     n, n_springs, n_sections = spec.n_chambers, spec.n_springs, spec.structure.n_sections
     off = partial(drawn, rng)
 
@@ -142,12 +135,6 @@ def _draw_holes(off: Callable[..., np.ndarray], spec: ArmSpec, std: Tolerances) 
         radius = each(spec.per_section(radius_m)) + off(std.hole_radius_m, n)
         hole_m[kind] = radius[:, None] * on_circle + each(ring_m)
     return hole_m
-
-
-def length_ratio(spec: ArmSpec) -> float:
-    """Return the mean length of an arm's sections over that of the paper's arm."""
-    paper = ArmSpec.default()
-    return float(np.mean(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m))
 
 
 def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:

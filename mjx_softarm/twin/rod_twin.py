@@ -34,6 +34,7 @@ from mjx_softarm.twin.instruments import (
     checked_payload,
     checked_pressures,
     drawn,
+    scaled_tolerances,
 )
 from mjx_softarm.twin.pneumatics import Pneumatics
 from mjx_softarm.twin.rod import Rod, RodParts
@@ -187,14 +188,6 @@ def draw_rod(
     def factors(deviation: float, *shape: int) -> np.ndarray:
         return 1.0 + drawn(rng, deviation, *shape)
 
-    # Laws of the chambers, with random numbers of their own
-    laws = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
-    range_kpa = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
-    hardening, growth = (
-        mean * laws.uniform(1.0 - LAW_SPREAD, 1.0 + LAW_SPREAD, per_chamber)
-        for mean in (std.hardening, std.area_growth / range_kpa)
-    )
-
     # The order of the draws belongs to the seed: another order makes other rods.
     length_m = of_section(geometry.section_length_m)
     rest_m = length_m[:, None] + of_chamber(chambers.length_offset_m)
@@ -212,18 +205,28 @@ def draw_rod(
         chamber_hole_m=_holes(rng, spec, std, geometry.chamber_radius_m, n_chambers),
         spring_hole_m=_holes(rng, spec, std, geometry.spring_radius_m, spec.springs_per_section),
         stiffness=of_chamber(chambers.stiffness_n_per_m) * factors(std.chamber_stiffness, *per_chamber),
-        hardening=hardening,
-        skew=drawn(laws, std.skew, *per_chamber),
+        **_chamber_laws(seed, spec, std),
         rest_m=rest_m + drawn(rng, std.chamber_length_m, *per_chamber),
         area=1e3 * of_chamber(chambers.area_m2) * area,
         area_slope=1e3 * of_chamber(chambers.area_slope_m) * area,
-        area_growth=growth,
         spring_stiffness=of_section(spec.springs.stiffness_n_per_m),
         spring_rest_m=of_section(spec.springs.rest_length_m),
         tool_mass_kg=np.array([spec.mass.gripper_kg, 0.0]),
         tool_offset_m=spec.mass.gripper_length_m * np.array([0.5, 1.0]),
         up=up,
     )
+
+
+def _chamber_laws(seed: int, spec: ArmSpec, std: RodTolerances) -> dict[str, np.ndarray]:
+    """Draw hardening, area growth and skew (s, c) of the chambers, with random numbers of their own."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
+    range_kpa = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
+    shape = spec.structure.n_sections, spec.structure.chambers_per_section
+    hardening, growth = (
+        mean * rng.uniform(1.0 - LAW_SPREAD, 1.0 + LAW_SPREAD, shape)
+        for mean in (std.hardening, std.area_growth / range_kpa)
+    )
+    return {"hardening": hardening, "area_growth": growth, "skew": drawn(rng, std.skew, *shape)}
 
 
 def _holes(
@@ -275,18 +278,14 @@ def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:
     """Return an arm's tolerances: lengths and compliances scale with those of the paper's arm."""
     paper = ArmSpec.default()
 
-    def of_section(value: PerSection) -> np.ndarray:
-        return np.array(spec.per_section(value))
+    def ratio(of_paper: PerSection, own: PerSection) -> np.ndarray:
+        """Return the paper's mean number over those of the arm's sections (n_sections,)."""
+        return np.mean(of_paper) / np.array(spec.per_section(own))
 
-    own, of_paper = spec.backbone, paper.backbone
-    length = np.mean(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m)
-    section = of_section(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m)
-    bending = np.mean(of_paper.bending_stiffness_nm_per_rad) / of_section(own.bending_stiffness_nm_per_rad)
-    axial = np.mean(of_paper.axial_stiffness_n_per_m) / of_section(own.axial_stiffness_n_per_m)
-    factors = {"torsion_rad_per_nm": bending, "shear_per_n": axial / section}
-    return RodTolerances(
-        **{
-            name: gap * x * (length if name.endswith("_m") else factors.get(name, 1.0))
-            for name, x in dataclasses.asdict(RodTolerances()).items()
-        }
+    bending = ratio(paper.backbone.bending_stiffness_nm_per_rad, spec.backbone.bending_stiffness_nm_per_rad)
+    axial = ratio(paper.backbone.axial_stiffness_n_per_m, spec.backbone.axial_stiffness_n_per_m)
+    section = np.array(spec.per_section(spec.geometry.section_length_m)) / np.mean(
+        paper.geometry.section_length_m
     )
+    factors = {"torsion_rad_per_nm": bending, "shear_per_n": axial / section}
+    return scaled_tolerances(RodTolerances(), gap, spec, **factors)

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_softarm._support.channel import End
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import Paced
@@ -27,6 +26,7 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.reachable import clamped
 from mjx_softarm.spec import ArmSpec
+from mjx_softarm.view.channel import End
 from mjx_softarm.view.look import look_at
 from mjx_softarm.view.taken_poses import TakenPoses
 

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import viser
 
-from mjx_softarm._support.channel import End
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
+from mjx_softarm.view.channel import End
 from mjx_softarm.view.look import Limits, Look
 from mjx_softarm.view.panel import BLUE, MUTED, Panel, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene

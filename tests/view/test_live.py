@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm._support.channel import End
 from mjx_softarm.deploy.goals import Orders
 from mjx_softarm.deploy.loop import Tick, start, with_goal
 from mjx_softarm.deploy.session import steer
+from mjx_softarm.view.channel import End
 from mjx_softarm.view.live import PagePilot, place_poses
 from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm
 

@@ -7,7 +7,7 @@ from multiprocessing import Pipe
 import numpy as np
 import pytest
 
-from mjx_softarm._support.channel import End
+from mjx_softarm.view.channel import End
 from mjx_softarm.view.look import look_at
 from tests.linear_arm import GOALS, POLICY, REST_M, SPEC, N
 

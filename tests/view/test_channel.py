@@ -6,7 +6,7 @@ from multiprocessing import Pipe
 import numpy as np
 import pytest
 
-from mjx_softarm._support.channel import End
+from mjx_softarm.view.channel import End
 
 
 def wait_for(condition, seconds=10.0):
