@@ -36,6 +36,8 @@ BENCHMARKS = {
     "film": "benchmarks.accuracy.film:film",
     "race": "benchmarks.race.race:race",
     "path": "benchmarks.accuracy.path:measure",
+    "loads": "benchmarks.accuracy.loads:measure",
+    "printed": "benchmarks.accuracy.printed:measure",
     "paper": "benchmarks.paper.experiments:Paper",
     "traces": "benchmarks.paper.traces:measure",
 }

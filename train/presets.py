@@ -7,6 +7,7 @@ import dataclasses
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp.rewards import RewardConfig
 from train.agent.analytic import AnalyticConfig
+from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import GoalStage, ImitationConfig
 from train.agent.tqc import TQCConfig
@@ -85,20 +86,6 @@ PRESETS: dict[str, TrainConfig] = {
         fresh_poses_epochs=4,
         env=dataclasses.replace(_EVEN, observation="payload"),
     ),
-    # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each
-    # step of the workers, and each transition stored again with the pose it achieved for its goal.
-    "as-printed": TrainConfig(
-        learner=TQCConfig(
-            n_arms=14,
-            total_env_steps=300_000,
-            updates_per_env_step=1 / 14,
-            warmup_env_steps=100,
-            replay_capacity=600_000,
-            hindsight=HindsightConfig(exchange_actions=False),
-            vector_steps_per_epoch=256,
-        ),
-        evaluation_epochs=20,
-    ),
     "motion": _MOTION,
     # A first try: an arm of fewer links is simulated faster; its tip is some 4 mm from that of four links.
     "motion-quick": dataclasses.replace(
@@ -140,6 +127,23 @@ _PIPE = ImitationConfig(
     replay_capacity=40_000,
     rebalance_env_steps=8_000,
 )
+
+# The paper's recipe as printed: 14 workers, sb3-contrib's hyperparameters, a gradient step for each step of
+# the workers. Each transition is stored again with the pose it achieved for its goal; the buffer of a million
+# holds both. Half of the goals come first, then all, with a fifth of the replay kept.
+_PRINTED = ImitationConfig(
+    n_arms=14,
+    total_env_steps=300_000,
+    updates_per_env_step=1 / 14,
+    warmup_env_steps=100,
+    replay_capacity=500_000,
+    vector_steps_per_epoch=256,
+    hindsight=HindsightConfig(exchange_actions=False, saturation_costs=False),
+    gail=GailConfig(penalty_on="probability", input_scale=1.0),
+    expert_share=0.0,
+    expert_start="shown",
+    stages=(GoalStage(share=1 / 3, every=2), GoalStage(share=2 / 3, kept=0.2)),
+)
 IMITATION_PRESETS: dict[str, TrainConfig] = {
     "circle": TrainConfig(
         learner=dataclasses.replace(
@@ -157,6 +161,11 @@ IMITATION_PRESETS: dict[str, TrainConfig] = {
         env=EnvConfig(reward=_ALWAYS),  # that of `quick`, whose critics a run may begin with
     ),
     "pipe": TrainConfig(learner=_PIPE, evaluation_epochs=2),
+    "paper-circle": TrainConfig(learner=_PRINTED, evaluation_epochs=7),
+    "paper-pipe": TrainConfig(
+        learner=dataclasses.replace(_PRINTED, total_env_steps=1_000_000, rebalance_env_steps=100_000),
+        evaluation_epochs=14,
+    ),
     # Half-second actions in motion. Payloads as they are carried: they change how the arm moves.
     "pipe-moving": TrainConfig(
         learner=_PIPE,

@@ -35,7 +35,6 @@ KINDS = {
     "without": Kind("calibrated springs"),
     "chambers": Kind("calibrated springs and chambers"),
     "with": Kind("with S2R"),
-    "as-printed": Kind("with S2R, the paper's recipe", reach="as-printed"),
     "quick": Kind("with S2R, quick", reach="quick"),
     "analytic": Kind("with S2R, analytic", reach="analytic"),
     "payload": Kind("with S2R, payload", reach="payload"),

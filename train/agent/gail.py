@@ -1,9 +1,10 @@
 """Discriminator that tells the expert's actions from the agent's, and the reward learned by it.
 
 The logit h(s, a, g) is high where the expert acts. It is trained by cross-entropy, expert 1 and agent 0. A
-penalty holds the length of its gradient near one at points between both. The reward log sigmoid(h) is the
-paper's log(1 - D) with D the probability of the agent. It changes with every update, so it is computed
-when a batch is sampled.
+penalty holds the length of its gradient near one at points between both. The paper's penalty is on the
+gradient of the probability D instead, which vanishes where the discriminator is sure. The reward
+log sigmoid(h) is the paper's log(1 - D) with D the probability of the agent. It changes with every update, so
+it is computed when a batch is sampled.
 
 Source: Ho and Ermon 2016, arXiv:1606.03476; gradient penalty: Gulrajani et al. 2017, arXiv:1704.00028.
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import flax.linen as nn
 import jax
@@ -25,7 +26,8 @@ from jax import Array
 
 from train.agent.learner import check_settings
 
-Logits = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...), high: expert
+Score = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...)
+Penalised = Literal["logit", "probability"]
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,14 @@ class GailConfig:
     hidden: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     learning_rate: float = 3e-4  # learning rate (Adam)
     gradient_penalty: float = 20.0  # weight of the gradient penalty, the paper's lambda
+    penalty_on: Penalised = "logit"  # output whose gradient is penalised; the paper's is the probability
     input_scale: float = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:
         required = {
             "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
             "gradient_penalty": (self.gradient_penalty >= 0.0, "a number >= 0"),
+            "penalty_on": (self.penalty_on in get_args(Penalised), f"one of {get_args(Penalised)}"),
             "input_scale": (self.input_scale > 0.0, "a number > 0"),
         }
         check_settings("learner.gail", self, required)
@@ -111,7 +115,9 @@ class Gail:
             logits = functools.partial(self.network.apply, params)
             on_expert, on_agent = logits(*expert), logits(*agent)
             entropy = cross_entropy(on_expert, on_agent)
-            penalty = gradient_penalty(logits, *between)
+            probability = lambda *pair: jax.nn.sigmoid(logits(*pair))  # noqa: E731
+            on_logit = self.config.penalty_on == "logit"
+            penalty = gradient_penalty(logits if on_logit else probability, *between)
             accuracy = 0.5 * (jnp.mean(on_expert > 0.0) + jnp.mean(on_agent < 0.0))
             metrics = {"discriminator_loss": entropy, "gradient_penalty": penalty, "accuracy": accuracy}
             return entropy + self.config.gradient_penalty * penalty, metrics
@@ -134,12 +140,12 @@ def cross_entropy(expert_logits: Array, agent_logits: Array) -> Array:
     return jnp.mean(jax.nn.softplus(-expert_logits)) + jnp.mean(jax.nn.softplus(agent_logits))
 
 
-def gradient_penalty(logits: Logits, obs: Array, action: Array) -> Array:
-    """Return the mean of (|grad h| - 1)^2 over points (B, O), (B, A), with the gradient by both.
+def gradient_penalty(score: Score, obs: Array, action: Array) -> Array:
+    """Return the mean of (|grad score| - 1)^2 over points (B, O), (B, A), with the gradient by both.
 
     Where the gradient vanishes, the derivative of its length is taken as zero.
     """
-    d_obs, d_action = jax.grad(lambda o, a: jnp.sum(logits(o, a)), argnums=(0, 1))(obs, action)
+    d_obs, d_action = jax.grad(lambda o, a: jnp.sum(score(o, a)), argnums=(0, 1))(obs, action)
     square = jnp.sum(d_obs**2, axis=-1) + jnp.sum(d_action**2, axis=-1)  # (B,)
     flat = square == 0.0  # (B,)
     length = jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, square)))  # (B,)

@@ -37,6 +37,7 @@ class HindsightConfig:
     near_max_mm: float = 100.0  # largest distance of a near goal
     mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
     exchange_actions: bool = True  # relabelled, a saturated action becomes the sensed one
+    saturation_costs: bool = True  # also where the goal is the pose reached; in the paper that has its bonus
 
     def __post_init__(self) -> None:
         total = self.reached_share + self.near_share
@@ -90,7 +91,7 @@ def relabel(
     # Actions: where a chamber saturated, the one that asks for the lengths it reached.
     sensed = (reached | near) & batch.saturated & config.exchange_actions
     action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
-    saturated = batch.saturated & ~sensed
+    saturated = batch.saturated & ~sensed & (config.saturation_costs | ~reached)
 
     # Error, reward and termination recomputed for the goals.
     reward, done, _ = rewards.reward(

@@ -10,6 +10,9 @@ expert's answers to their goals, and the discriminator compares these with the a
 The learned reward is for goals that were asked for; the discriminator does not know relabelled goals. The
 reward is never positive, and an episode ends with the goal reached or by the clock, so delay earns nothing.
 
+The paper's discriminator compares other pairs (`expert_start`): the expert's actions at the poses shown
+before, and the agent's batch with its relabelled goals. There every row has the learned reward.
+
 Shapes: B batch, O observation, A action, m demonstrated positions.
 """
 
@@ -19,7 +22,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +36,9 @@ from train.agent.gail import DiscriminatorState, Gail, GailConfig
 from train.agent.learner import Experience, Explored, Learner, Sample, Transition, check_settings
 from train.agent.networks import check_same_shapes
 from train.agent.tqc import HindsightTQC, TQCConfig
-from train.demos.demonstrations import Demonstrations
+from train.demos.demonstrations import Demonstrations, shown_before
+
+ExpertStart = Literal["agent", "shown"]
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,9 @@ class ImitationConfig(TQCConfig):
     """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
     expert_share: float = 0.25
     """share of the critics' batches that is the expert's; in motion, share of the arms' actions"""
+    expert_start: ExpertStart = "agent"
+    """state at which the discriminator sees the expert's action: the agent's; or, as in the paper, the pose
+    shown before"""
     stages: Annotated[tuple[GoalStage, ...], _STAGES_OPTION] = (GoalStage(),)
     """stages in order: share of the env steps (all add up to 1), every n-th pose is a goal, share of the
     replay that is kept as the stage begins"""
@@ -99,6 +107,7 @@ class ImitationConfig(TQCConfig):
         apart = len(set(self.stage_epochs)) == len(self.stages)
         required = {
             "expert_share": (0.0 <= self.expert_share < 1.0, "0 or more and less than 1"),
+            "expert_start": (self.expert_start in get_args(ExpertStart), f"one of {get_args(ExpertStart)}"),
             "learned_weight": (self.learned_weight >= 0, "a number >= 0"),
             "hand_made_weight": (
                 hand_made,
@@ -111,8 +120,13 @@ class ImitationConfig(TQCConfig):
         check_settings("learner", self, required)
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ValueError where the policy observes the payload: a demonstrated action is right for one."""
+        """Raise ValueError for an environment that does not suit demonstrations.
+
+        A demonstrated action is right for one payload. A pose that was shown is no state in motion.
+        """
         super().check(env)
+        start = self.expert_start == "agent" or not env.moves
+        check_settings("learner", self, {"expert_start": (start, "'agent' in motion")})
         if env.observation == "payload":
             expected = "'pose' or 'motion' for demonstrations"
             raise ValueError(f"env.observation: got 'payload', expected {expected}")
@@ -148,6 +162,7 @@ class Imitation(Learner):
         self.learner, self.config, self.env = HindsightTQC(config, env), config, env
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
         self.actions = jnp.asarray(demonstrations.actions)  # (m, A)
+        self.before = jnp.asarray(shown_before(demonstrations.sequence))  # (m,)
         self.gail = Gail(env.observation_size, env.action_size, config.gail)
         at_rest = not env.config.moves
         self.n_expert = round(at_rest * config.expert_share * config.batch_size)  # rows of a batch
@@ -189,11 +204,16 @@ class Imitation(Learner):
             batch = self.with_expert(batch, stored, index)
             relabelled = relabelled.at[: self.n_expert].set(False)
 
-        # Discriminator: the expert's actions against the agent's, at the same observations.
-        if discriminator is not None and not self.config.frozen:
+        # Discriminator: the expert's actions against the agent's, at one observation or as in the paper.
+        if self.config.expert_start == "shown":
+            start = self.env.observe(self.positions[self.before[index]], self.positions[index])  # (B, O)
+            pairs = (start, self.actions[index]), (batch.obs, batch.action)
+            relabelled = jnp.zeros_like(relabelled)  # their goals are known to the discriminator
+        else:
             start = self.env.observe(stored.pose, stored.goal, stored.sensed)  # (B, O)
             agent = self.of_agent(state, stored, start, key_between)  # (B, A)
             pairs = (start, self.actions[index]), (start, agent)
+        if discriminator is not None and not self.config.frozen:
             discriminator, metrics = self.gail.update(discriminator, *pairs, key_between)
 
         # Agent: the batch with rewards of the updated discriminator.

@@ -71,6 +71,11 @@ def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
     )
 
 
+def shown_before(sequence: np.ndarray) -> np.ndarray:
+    """Return which position (m,) was shown before each; the first of a sequence stands for itself."""
+    return np.arange(len(sequence)) - (np.diff(sequence, prepend=-1) == 0)
+
+
 def _not_finite(matrix: LogMatrix) -> Iterator[Finding]:
     needed = matrix.indices("time_s", *NEEDED)
     for row, k in np.argwhere(~np.isfinite(matrix.values[:, needed])):

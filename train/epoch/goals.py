@@ -23,7 +23,7 @@ from mjx_softarm.env.state import State
 from mjx_softarm.mechanics.workspace import Pool
 from train.agent.imitation import ImitationConfig
 from train.config import ConfigError
-from train.demos.demonstrations import Demonstrations
+from train.demos.demonstrations import Demonstrations, shown_before
 from train.epoch.job import Job, TrainState
 
 EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they are reached
@@ -104,11 +104,6 @@ def static_poses(env: ReachEnv, actions: np.ndarray) -> Pool:
         raise ConfigError(f"demonstrations: got rows {lost}, at which the arm does not settle, expected none")
     arm = after.pipeline_state
     return Pool(arm.motion.q, arm.pressure_kpa, arm.spring_m, arm.pose)
-
-
-def shown_before(sequence: np.ndarray) -> np.ndarray:
-    """Return which position (m,) was shown before each; the first of a sequence stands for itself."""
-    return np.arange(len(sequence)) - (np.diff(sequence, prepend=-1) == 0)
 
 
 def goal_weights(error_mm: Sequence[float] | np.ndarray, goals: np.ndarray) -> np.ndarray:

@@ -86,7 +86,8 @@ class Imitate(NewRunOptions):
     """demonstrations as `demos record` writes them"""
     preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
     """settings to begin with. pipe: the learned reward; pipe-moving: the learned reward on arms in motion;
-    circle: the learned reward and the environment's, in two stages"""
+    circle: the learned reward and the environment's, in two stages; paper-circle, paper-pipe: the paper's own
+    recipe"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""

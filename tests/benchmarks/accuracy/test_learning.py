@@ -32,7 +32,7 @@ def test_targets_are_those_of_the_groups_presets_for_means_over_seeds():
     quick = {"over_seeds": spread(median_mm=2.01)}
     names = ("median_mm", "p95_mm", "circle_mean_mm", "even_median_mm", "even_p95_mm")
     analytic = spread(**dict.fromkeys(names, 0.6), reached_share=0.97)
-    groups = [{"preset": "quick", **quick}, {"preset": None}, {"preset": "as-printed"}]
+    groups = [{"preset": "quick", **quick}, {"preset": None}, {"preset": "payload"}]
     moving = {"preset": "motion-analytic", "over_seeds": spread(median_mm=3.0)}
     found = targets([*groups, {"preset": "analytic", "over_seeds": analytic}, moving])
     *found, met, not_evaluated = found

@@ -34,6 +34,22 @@ def test_penalty_of_a_discriminator_of_known_slope():
     np.testing.assert_allclose(penalty, np.mean((slope - 1.0) ** 2), rtol=1e-5)
 
 
+@pytest.mark.parametrize("penalty_on", ["logit", "probability"])
+def test_the_penalty_is_on_the_logit_or_as_printed_on_the_probability(penalty_on):
+    """The probability's slope is D (1 - D) times the logit's."""
+    gail = Gail(5, 3, GailConfig(hidden=(8,), input_scale=1.0, penalty_on=penalty_on))
+    state, (obs, action) = gail.init(jax.random.PRNGKey(0)), (jnp.array(OBS), jnp.array(ACTION))
+    pair = (obs, action), (obs, action)  # all points between the two are the pair itself
+    _, metrics = jax.jit(gail.update)(state, *pair, jax.random.PRNGKey(1))
+    logit = lambda x: gail.network.apply(state.params, x[:5], x[5:])  # noqa: E731
+    rows = jnp.concatenate([obs, action], axis=-1)
+    slope = np.linalg.norm(jax.vmap(jax.grad(logit))(rows), axis=-1)
+    if penalty_on == "probability":
+        probability = 1.0 / (1.0 + np.exp(-jax.vmap(logit)(rows)))
+        slope = slope * probability * (1.0 - probability)
+    np.testing.assert_allclose(metrics["gradient_penalty"], np.mean((slope - 1.0) ** 2), rtol=1e-4)
+
+
 def test_slope_of_the_penalty_of_a_linear_discriminator():
     # d/dw (|w| - 1)^2 = 2 (|w| - 1) w / |w|
     w = np.array([0.3, -0.4, 1.2, 0.0, 0.5])
@@ -63,7 +79,8 @@ def test_an_update_descends_on_the_loss_and_its_penalty():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("learning_rate", -1.0), ("gradient_penalty", -1.0), ("input_scale", 0.0)]
+    ("name", "value"),
+    [("learning_rate", -1.0), ("gradient_penalty", -1.0), ("input_scale", 0.0), ("penalty_on", "D")],
 )
 def test_a_bad_setting_is_named(name, value):
     with pytest.raises(ValueError, match=f"learner.gail.{name}: got"):

@@ -99,6 +99,16 @@ def test_only_a_saturated_action_is_exchanged_for_the_sensed_one(relabelled):
     assert -100.0 not in np.asarray(batch.reward)
 
 
+def test_as_printed_actions_stay_and_a_reached_pose_pays_though_a_chamber_saturates(env, relabelled):
+    settings, pays = {"reached_share": 1.0, "exchange_actions": False}, env.config.reward
+    many, batch = relabelled(saturation_costs=False, **settings)
+    np.testing.assert_array_equal(batch.action, many.action)
+    np.testing.assert_array_equal(batch.reward, pays.goal_bonus)
+    _, batch = relabelled(**settings)
+    costs = np.where(many.saturated, -pays.saturation_cost, pays.goal_bonus)
+    np.testing.assert_array_equal(batch.reward, costs)
+
+
 def test_a_sensed_action_leads_to_the_same_rest_with_no_chamber_saturated(transition, stored, step):
     state, _, after = transition
     again = step(state, stored.sensed_action)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import Imitation
 from train.agent.learner import Experience
 from train.agent.tqc import Transition
@@ -84,6 +85,27 @@ def test_an_update_moves_the_discriminator_unless_it_is_frozen(new, stored, froz
     assert float(metrics["gail/reward"]) < 0.0
     policies = [jax.tree.leaves(learner.policy(state)) for state in (before, after)]
     assert not np.array_equal(policies[0][-1], policies[1][-1])
+
+
+def test_as_printed_the_expert_is_at_the_pose_shown_before_and_relabelled_goals_have_the_learned_reward(
+    new, stored, short_env, shown
+):
+    learner, seen = new(expert_start="shown", expert_share=0.0, hindsight=HindsightConfig(1.0)), {}
+    update = learner.gail.update
+    learner.gail.update = lambda s, e, a, key: seen.update(expert=e, agent=a) or update(s, e, a, key)
+    learner.learner.learn = lambda agent, batch, key: seen.update(batch=batch) or (agent, {})
+    state = jax.jit(learner.init)(jax.random.PRNGKey(0))
+    after, _ = learner.update(state, lambda *_: stored, jax.random.PRNGKey(1))
+    goal = (np.arange(B) + 1) % 6
+    positions = jnp.asarray(shown.positions)
+    shown_at = short_env.observe(positions[np.maximum(goal - 1, 0)], positions[goal])  # one sequence
+    np.testing.assert_array_equal(seen["expert"][0], shown_at)
+    np.testing.assert_array_equal(seen["expert"][1], jnp.asarray(shown.actions)[goal])
+    batch = seen["batch"]
+    np.testing.assert_array_equal(seen["agent"][0], short_env.observe(stored.pose, stored.next_pose))
+    np.testing.assert_array_equal(seen["agent"][0], batch.obs)
+    learned = learner.gail.reward(after.discriminator.params, batch.obs, batch.action)
+    np.testing.assert_allclose(batch.reward, learned - stored.clearance_cost, rtol=1e-5)
 
 
 @pytest.fixture

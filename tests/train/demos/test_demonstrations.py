@@ -9,7 +9,12 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import Log, log_table, write_log
 from mjx_softarm.sensing.pose import frame_from_pose
-from train.demos.demonstrations import NEEDED, load_demonstrations, read_demonstrations
+from train.demos.demonstrations import (
+    NEEDED,
+    load_demonstrations,
+    read_demonstrations,
+    shown_before,
+)
 
 SPEC = ArmSpec.default()
 SEQUENCE = np.array([0, 0, 0, 5, 2, 2])
@@ -106,3 +111,7 @@ def test_every_mistake_has_a_line_and_unknown_columns_are_told(tmp_path, file):
     np.savetxt(path, np.column_stack([table, np.zeros(6)]), "%.9g", ",", header=header, comments="")
     log, extra = read_demonstrations(path, SPEC)
     assert len(log) == 6 and [finding.column for finding in extra] == ["colour"]
+
+
+def test_the_position_shown_before_is_of_the_same_sequence():
+    np.testing.assert_array_equal(shown_before(np.array([4, 4, 4, 0, 0, 7])), [0, 0, 1, 3, 3, 5])

@@ -10,7 +10,7 @@ import pytest
 from train.agent.imitation import Imitation
 from train.config import ConfigError
 from train.epoch.devices import mesh_of
-from train.epoch.goals import DemonstratedGoals, goal_weights, shown_before, static_poses
+from train.epoch.goals import DemonstratedGoals, goal_weights, static_poses
 from train.epoch.job import Job
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -96,10 +96,6 @@ def test_actions_at_which_the_arm_does_not_settle_are_named(moving_env, shown):
     actions = shown.actions.at[2].set(np.nan)
     with pytest.raises(ConfigError, match="demonstrations: got rows 2, at which the arm does not settle"):
         static_poses(moving_env, actions)
-
-
-def test_the_position_shown_before_is_of_the_same_sequence():
-    np.testing.assert_array_equal(shown_before(np.array([4, 4, 4, 0, 0, 7])), [0, 0, 1, 3, 3, 5])
 
 
 def test_stages_change_the_goals_and_thin_the_replay(job):

@@ -1,0 +1,281 @@
+"""The paper's recipe as printed: circle and pipe, learned and hand-made reward, and one change at a time.
+
+All runs are in the simulation at rest, on the training model. Demonstrations are the scripted expert's
+postures in this simulation. A run whose results exist is not repeated: seeds and cases may be added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from benchmarks.harness.common import RESULTS, names_of
+from benchmarks.paper.engine import WorkStage, command, run_stages
+from benchmarks.paper.kinds import EVALUATION_FILE
+from mjx_softarm._support import cli, xla
+from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.mechanics.pipe import PIPES_MM
+from mjx_softarm.sensing.pose import quaternion_from_pose
+from mjx_softarm.spec import ArmSpec
+from train.demos.demonstrations import Demonstrations
+from train.demos.expert import Expert
+from train.demos.waypoints import task as waypoints_of
+from train.runs import plots
+from train.runs.checkpoint import Run
+from train.runs.positions import PositionEvaluator
+from train.runs.run import task_of_run
+
+PICTURE = "printed.png"
+N_POINTS = 40  # of the circle that a policy of its 16 demonstrated points follows
+PRESETS = {"circle16": "paper-circle", "pipe300": "paper-pipe"}
+LOSSES = {"tqc/critic_loss": "critics' loss", "tqc/actor_loss": "actor's loss"}
+LOSSES |= {"gail/discriminator_loss": "discriminator's loss"}
+
+
+class Case(NamedTuple):
+    """A preset of the paper with some settings changed."""
+
+    task: str  # key of PRESETS
+    settings: tuple[str, ...] = ()  # NAME=VALUE
+    one_seed: bool = False  # the first seed alone
+
+
+HAND_MADE = ("learner.learned_weight=0", "learner.hand_made_weight=1")
+NEAR = ("learner.hindsight.reached_share=0.25", "learner.hindsight.near_share=0.5")
+EXCHANGE = ("learner.hindsight.exchange_actions=true",)
+DISCOUNT = ("learner.gamma=0.5",)
+ON_LOGIT = ("learner.gail.penalty_on=logit",)
+AT_AGENT = ("learner.expert_start=agent",)
+CASES = {
+    "circle, learned": Case("circle16"),
+    "circle, hand-made": Case("circle16", HAND_MADE),
+    "pipe, learned": Case("pipe300"),
+    "pipe, hand-made": Case("pipe300", HAND_MADE),
+    # One change each.
+    "circle, hand-made, near goals": Case("circle16", (*HAND_MADE, *NEAR), True),
+    "circle, hand-made, exchange": Case("circle16", (*HAND_MADE, *EXCHANGE), True),
+    "circle, hand-made, discount": Case("circle16", (*HAND_MADE, *DISCOUNT), True),
+    "circle, hand-made, all three": Case("circle16", (*HAND_MADE, *NEAR, *EXCHANGE, *DISCOUNT), True),
+    "circle, learned, discount": Case("circle16", DISCOUNT, True),
+    "circle, learned, penalty on the logit": Case("circle16", ON_LOGIT, True),
+    "circle, learned, expert at the agent's state": Case("circle16", AT_AGENT, True),
+    "circle, learned, all three": Case("circle16", (*DISCOUNT, *ON_LOGIT, *AT_AGENT), True),
+    # The penalty's effect on the losses.
+    "circle, learned, no penalty": Case("circle16", ("learner.gail.gradient_penalty=0",), True),
+}
+
+
+@dataclass(frozen=True)
+class PrintedSettings:
+    """Further settings of the runs."""
+
+    pipe_env_steps: int | None = None  # of the pipe's runs; None: the preset's
+
+
+def measure(
+    out: Path = Path("runs/printed"),
+    seeds: cli.Integers = (0, 1, 2),
+    cases: Annotated[tuple[str, ...], names_of(CASES)] = tuple(CASES),
+    pipe_env_steps: int | None = None,
+) -> dict[str, Any]:
+    """Does the paper's recipe work as printed, in simulation, and what does each change to it bring?
+
+    The picture is `docs/results/printed.png`.
+
+    Args:
+        out: working folder: the same command continues, and seeds and cases may be added
+        seeds: of training; changes have the first alone
+        cases: which; None: all
+        pipe_env_steps: of each run in the pipe; None: a million, as in the paper
+
+    Raises:
+        JobError: a training failed.
+    """
+    # Demonstrate, and train what is not trained yet.
+    out.mkdir(parents=True, exist_ok=True)
+    runs = {name: seeds[:1] if CASES[name].one_seed else seeds for name in cases}
+    tasks = dict.fromkeys(CASES[name].task for name in cases)
+    demonstrated = [WorkStage(f"demonstrate {t}", (demos_file(t),), demonstrate, (t,)) for t in tasks]
+    trained = [
+        WorkStage(f"{name}, seed {seed}", (f"{run_name(name, seed)}/{EVALUATION_FILE}",), train, (name, seed))
+        for name, own in runs.items()
+        for seed in own
+    ]
+    run_stages(out, PrintedSettings(pipe_env_steps), [demonstrated, trained])
+    # Gather the figures, and draw the curves.
+    opened = {name: [Run.open(out / run_name(name, seed)) for seed in own] for name, own in runs.items()}
+    metrics = {name: [run.metrics() for run in own] for name, own in opened.items()}
+    curves_figure(metrics).savefig(RESULTS / PICTURE, dpi=plots.DPI)
+    circles = circle_errors([run for name, own in opened.items() if "circle" in name for run in own])
+    return {
+        "cases": [
+            over_seeds(name, metrics[name], [circles.get(r.path, {}) for r in opened[name]]) for name in runs
+        ],
+        "losses": [
+            row
+            for name in runs
+            if "learned" in name and "circle" in name
+            for row in loss_rows(name, metrics[name][0])
+        ],
+        "curves": curves(metrics),
+    }
+
+
+def demos_file(task: str) -> str:
+    """Return the path of a task's demonstrations in the folder."""
+    return f"demos/{task}.npz"
+
+
+def run_name(case: str, seed: int) -> str:
+    """Return the name of a run's folder."""
+    return f"{case.replace(',', '').replace(' ', '-').replace(chr(39), '')}-seed{seed}"
+
+
+def demonstrate(folder: Path, settings: PrintedSettings, task: str) -> None:
+    """Write the demonstrations of a task, the expert's postures as the training model has them."""
+    xla.enable_compilation_cache()
+    file, spec = folder / demos_file(task), ArmSpec.default()
+    file.parent.mkdir(exist_ok=True)
+    waypoints, pipe = waypoints_of(task, spec)
+    plan = Expert(spec, None, pipe).plan(waypoints)
+    pose, n = np.asarray(plan.pose, float), len(waypoints)
+    write_log(
+        file,
+        Log(
+            source="demonstrations",
+            row=np.arange(2, n + 2),
+            time_s=np.arange(n, dtype=float),
+            readings=spec.spring_sensor.readings(np.asarray(plan.spring_m, float)),
+            tip_m=1e-3 * pose[:, :3],
+            tip_quaternion=quaternion_from_pose(pose),
+            sequence=np.zeros(n),
+            reading_name=spec.sensor.reading_name,
+        ),
+    )
+
+
+def train(folder: Path, settings: PrintedSettings, name: str, seed: int) -> None:
+    """Train a policy of a case, or resume an interrupted run."""
+    run, case = folder / run_name(name, seed), CASES[name]
+    log = run.with_suffix(".log")
+    if (run / "config.json").exists():
+        command(log, "imitate", "--resume", str(run))
+        return
+    options = ["--preset", PRESETS[case.task], "--seed", str(seed), "--out", str(run)]
+    if diameter_mm := PIPES_MM.get(case.task):
+        options += ["--pipe", str(diameter_mm)]
+        if settings.pipe_env_steps:
+            options += ["--learner.total-env-steps", str(settings.pipe_env_steps)]
+    command(log, "imitate", str(folder / demos_file(case.task)), *options, *(f"--{x}" for x in case.settings))
+
+
+def circle_errors(runs: Sequence[Run]) -> dict[Path, dict[str, float]]:
+    """Return the errors [mm] of runs at all points of the circle, by folder; mean and RMSE."""
+    evaluate, errors = None, {}
+    for run in runs:
+        if evaluate is None:
+            own, positions = task_of_run(run).evaluate, circle_poses(run.spec, N_POINTS)
+            shown = Demonstrations(
+                positions, np.zeros((N_POINTS, run.spec.n_springs)), np.zeros(N_POINTS, int)
+            )
+            evaluate = PositionEvaluator(own.env, own.learner, shown, np.ones(N_POINTS, bool))
+        _, found = evaluate(run.policy())
+        mm = found.reached.tip_error_mm
+        errors[run.path] = {"circle_mm": float(mm.mean()), "circle_rmse_mm": float(np.sqrt((mm**2).mean()))}
+    return errors
+
+
+FIGURES = (
+    *("success_share", "reached_share", "median_mm", "max_mm", "x_mm", "y_mm", "z_mm"),
+    *("saturated_positions", "outside_positions"),
+)
+
+
+def over_seeds(
+    name: str, metrics: Sequence[Sequence[Mapping[str, Any]]], circles: Sequence[Mapping[str, float]]
+) -> dict[str, Any]:
+    """Return the final figures of a case: mean over its seeds, and least and greatest."""
+    last = [{key.removeprefix("evaluation/"): x for key, x in rows[-1].items()} for rows in metrics]
+    rows = [row | dict(circle) for row, circle in zip(last, circles, strict=True)]
+    names = [key for key in (*FIGURES, "circle_mm", "circle_rmse_mm") if key in rows[0]]
+    counts = {key: rows[0][key] for key in ("env_steps", "updates")}
+    return {
+        "case": name,
+        "seeds": len(rows),
+        **counts,
+        **{key: _spread([row[key] for row in rows]) for key in names},
+    }
+
+
+def _spread(values: Sequence[float]) -> str:
+    mean, low, high = (f"{x:.4g}" for x in (np.mean(values), min(values), max(values)))
+    return mean if low == high else f"{mean} ({low} to {high})"
+
+
+def curves(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> dict[str, dict[str, Any]]:
+    """Return the success [%] of each seed at the evaluations of each case."""
+    found = {}
+    for name, runs in metrics.items():
+        rows = [[row for row in run if "evaluation/success_share" in row] for run in runs]
+        percent = [[round(100 * row["evaluation/success_share"], 1) for row in run] for run in rows]
+        found[name] = {"env_steps": [row["env_steps"] for row in rows[0]], "success_percent": percent}
+    return found
+
+
+def loss_rows(name: str, rows: Sequence[Mapping[str, float]]) -> list[dict[str, Any]]:
+    """Return how each loss of a run begins, ends and fluctuates.
+
+    The fluctuation is the median change from epoch to epoch, in the second half of the run.
+    """
+    found = []
+    for key, title in LOSSES.items():
+        values = np.array([row[key] for row in rows if row["updates"]])
+        tenth, half = max(1, len(values) // 10), len(values) // 2
+        found.append(
+            {
+                "case": name,
+                "loss": title,
+                "first tenth": float(values[:tenth].mean()),
+                "last tenth": float(values[-tenth:].mean()),
+                "fluctuation": float(np.median(np.abs(np.diff(values[half:])))),
+            }
+        )
+    return found
+
+
+def curves_figure(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
+    """Draw success over env steps on circle and in the pipe, and the losses with and without the penalty."""
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    panels = figure.subplots(2, 3)
+    # Success: mean over the seeds, with a band.
+    for panel, task in zip(panels[0], ("circle", "pipe"), strict=False):
+        plots.dress(panel, f"{task}: demonstrated positions with success", plots.STEPS, "%")
+        for colour, reward in zip((plots.BLUE, plots.ORANGE), ("learned", "hand-made"), strict=True):
+            if (name := f"{task}, {reward}") in metrics:
+                curve = curves({name: metrics[name]})[name]
+                percent = np.array(curve["success_percent"])
+                panel.plot(curve["env_steps"], percent.mean(axis=0), color=colour, label=f"{reward} reward")
+                band = percent.min(axis=0), percent.max(axis=0)
+                panel.fill_between(curve["env_steps"], *band, color=colour, alpha=0.2, linewidth=0)
+        panel.set_ylim(-2, 102)
+        panel.legend(frameon=False)
+    panels[0][2].set_axis_off()
+    # Losses, of the first seed.
+    penalties = {"": "on D, as printed", ", penalty on the logit": "on the logit", ", no penalty": "none"}
+    for panel, (key, title) in zip(panels[1], LOSSES.items(), strict=True):
+        plots.dress(panel, f"circle, learned: {title}", plots.STEPS, "")
+        for k, (change, label) in enumerate(penalties.items()):
+            if runs := metrics.get(f"circle, learned{change}"):
+                rows = [row for row in runs[0] if row["updates"]]
+                steps = [row["env_steps"] for row in rows]
+                panel.plot(steps, [row[key] for row in rows], color=colormaps["tab10"](k), label=label)
+        panel.set_yscale("symlog")
+        panel.legend(frameon=False, title="gradient penalty")
+    return figure

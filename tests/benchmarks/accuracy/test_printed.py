@@ -1,0 +1,109 @@
+"""The paper's recipe as printed: its cases, its demonstrations and its figures, on made-up courses."""
+
+import numpy as np
+import pytest
+
+from benchmarks.accuracy import printed
+from benchmarks.accuracy.printed import CASES, PRESETS, curves, curves_figure, loss_rows, over_seeds, run_name
+from mjx_softarm import ArmSpec
+from train.config import override
+from train.demos.demonstrations import load_demonstrations
+from train.demos.posture import Posture
+from train.presets import IMITATION_PRESETS
+
+
+def course(success, median_mm=5.0, losses=(4.0, 4.0, 2.0, 2.0, 1.0, 1.0)):
+    """Six epochs, the first without updates; the evaluations after the third and the last tell `success`."""
+    rows = []
+    for epoch, loss in enumerate(losses, 1):
+        row = {"epoch": epoch, "env_steps": 100 * epoch, "updates": 10 * (epoch - 1)}
+        row |= dict.fromkeys(printed.LOSSES, loss)
+        if epoch in (3, 6):
+            row |= {"evaluation/success_share": success[epoch // 6], "evaluation/median_mm": median_mm}
+        rows.append(row)
+    return rows
+
+
+def test_every_case_is_a_preset_of_the_paper_with_other_settings():
+    names = [run_name(name, 0) for name in CASES]
+    assert len(set(names)) == len(names) and not any(set(" ,'") & set(name) for name in names)
+    configs = [override(IMITATION_PRESETS[PRESETS[c.task]], c.settings) for c in CASES.values()]
+    assert len(set(configs)) == len(configs)
+
+
+def test_the_paper_s_recipe_is_as_printed():
+    circle, pipe = (IMITATION_PRESETS[name].learner for name in ("paper-circle", "paper-pipe"))
+    for learner in (circle, pipe):
+        assert (learner.n_arms, learner.n_updates_per_vector_step, learner.batch_size) == (14, 1, 256)
+        assert (learner.gamma, learner.learning_rate, learner.tau) == (0.99, 3e-4, 0.005)
+        assert (learner.gail.gradient_penalty, learner.gail.penalty_on) == (20.0, "probability")
+        assert learner.hindsight.near_share == 0.0 == learner.expert_share
+        assert not learner.hindsight.exchange_actions and learner.expert_start == "shown"
+        assert learner.stages[1].kept == 0.2 and learner.stages[0].every == 2
+    ends = [circle.n_env_steps(epochs) for epochs in (circle.stage_epochs[1], circle.n_epochs)]
+    assert ends == pytest.approx([1e5, 3e5], rel=0.01)
+    assert (pipe.total_env_steps, pipe.rebalance_env_steps) == (1_000_000, 100_000)
+
+
+def test_demonstrations_are_the_expert_s_postures(tmp_path, monkeypatch):
+    spec = ArmSpec.default()
+    pose = np.array([[k, 2.0 * k, -560.0, 10.0, -k, 3.0] for k in range(16)])
+    spring_m = np.linspace(0.17, 0.19, 16 * spec.n_springs).reshape(16, -1)
+    plan = Posture(None, spring_m, pose, None, None, None, None)
+    monkeypatch.setattr(printed, "Expert", lambda *_: type("Planner", (), {"plan": lambda *_: plan}))
+    printed.demonstrate(tmp_path, printed.PrintedSettings(), "circle16")
+    shown = load_demonstrations(tmp_path / "demos/circle16.npz", spec)
+    np.testing.assert_allclose(shown.positions, pose, atol=1e-3)
+    np.testing.assert_array_equal(shown.sequence, 0)
+    assert np.all(np.diff(shown.actions[:, 0]) != 0.0)
+
+
+def test_a_training_resumes_what_there_is(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(printed, "command", lambda log, *words: calls.append(words))
+    settings = printed.PrintedSettings(pipe_env_steps=600_000)
+    printed.train(tmp_path, settings, "pipe, hand-made", 1)
+    run = tmp_path / "pipe-hand-made-seed1"
+    run.mkdir()
+    (run / "config.json").touch()
+    printed.train(tmp_path, settings, "pipe, hand-made", 1)
+    new, resumed = calls
+    assert resumed == ("imitate", "--resume", str(run))
+    assert new[:4] == ("imitate", str(tmp_path / "demos/pipe300.npz"), "--preset", "paper-pipe")
+    assert {"--pipe", "300", "600000", "--learner.learned_weight=0"} <= set(new)
+
+
+def test_figures_are_over_the_seeds_of_a_case():
+    runs = [course((0.0, 0.5)), course((0.25, 1.0), median_mm=3.0)]
+    row = over_seeds("circle, learned", runs, [{"circle_mm": 2.0}, {"circle_mm": 2.0}])
+    assert row == {
+        "case": "circle, learned",
+        "seeds": 2,
+        "env_steps": 600,
+        "updates": 50,
+        "success_share": "0.75 (0.5 to 1)",
+        "median_mm": "4 (3 to 5)",
+        "circle_mm": "2",
+    }
+    assert curves({"circle, learned": runs}) == {
+        "circle, learned": {"env_steps": [300, 600], "success_percent": [[0.0, 50.0], [25.0, 100.0]]}
+    }
+
+
+def test_losses_begin_with_the_first_update():
+    first, *_ = loss_rows("circle, learned", course((0.0, 1.0), losses=(9.0, 4.0, 2.0, 2.0, 1.0, 1.5)))
+    assert first == {
+        "case": "circle, learned",
+        "loss": "critics' loss",
+        "first tenth": 4.0,
+        "last tenth": 1.5,
+        "fluctuation": 0.75,
+    }
+
+
+def test_success_and_losses_are_drawn():
+    metrics = {name: [course((0.0, 0.5))] * 2 for name in CASES}
+    figure = curves_figure(metrics)
+    circle, pipe, _, *losses = figure.axes
+    assert [len(panel.lines) for panel in (circle, pipe, *losses)] == [2, 2, 3, 3, 3]
+    assert [line.get_label() for line in losses[0].lines] == ["on D, as printed", "on the logit", "none"]
