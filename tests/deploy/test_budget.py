@@ -144,7 +144,7 @@ def test_a_reading_that_was_lost_on_arrival_does_not_count(tmp_path):
 def test_measure_tells_the_parts_and_logs_the_payload(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     save_policy(tmp_path / "policy.npz", POLICY)
-    monkeypatch.setattr("mjx_softarm.deploy.__main__._controller", lambda path: CONTROLLER)
+    monkeypatch.setattr("mjx_softarm.deploy.__main__._controller", lambda *at: CONTROLLER)
     monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: Planted(policy=POLICY))
     monkeypatch.setattr("mjx_softarm.deploy.__main__.read_goals", lambda *at: GOALS)
     out = tmp_path / "out"
