@@ -22,7 +22,7 @@ from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, 
 from mjx_softarm.deploy.lost import begun_again, without
 from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, lost_chambers, names
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.mdp.rewards import weighted_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
 
 _ROUNDING_S = 1e-6  # rounding error of a simulated tick's duration
@@ -225,7 +225,7 @@ class _Session:
         if np.isnan(error).any():
             error, how = pose_error(np.asarray(estimate, float), goal), "the springs"
         reward = self.controller.policy.reward
-        share = float(np.linalg.norm(scaled_error(goal + error, goal, reward))) / reward.threshold
+        share = float(weighted_error(goal + error, goal, reward)) / reward.threshold
         reached = share < 1.0
         self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, self.goals.n_taken - 1, reached))
         asked = np.where(reward.asked, error, 0.0)

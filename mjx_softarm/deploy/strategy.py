@@ -21,7 +21,7 @@ from mjx_softarm.control import allocated_error
 from mjx_softarm.deploy.belief import Belief, pose_of
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
-from mjx_softarm.mdp.rewards import asked_error, scaled_error
+from mjx_softarm.mdp.rewards import asked_error, weighted_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import ShapeLag, WayError, spring_lag_s
 from mjx_softarm.policy.reach import followed
@@ -63,7 +63,7 @@ class AtRest(NamedTuple):
         if belief.settled:
             pose, left = _left(self, belief, goal)
             shifts = [_clipped(self.shift - share * left, config.shift_limit) for share in config.shares]
-            allowed = max(_error(belief, pose, goal), policy.reward.threshold)
+            allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
 
         # The next action, or the arrival after the last one.
         events = _unsettled(belief)
@@ -85,7 +85,7 @@ class AtRest(NamedTuple):
             reference_m = _planned(belief, belief.pose, goal + shift)
             if allowed is not None:
                 pose = _made(belief, reference_m, belief.load)
-                if _error(belief, pose, goal) > allowed:
+                if weighted_error(pose, goal, belief.controller.policy.reward) > allowed:
                     continue
             after = AtRest(shift, self.n_actions + 1, belief.load)
             return Choice(after, reference_m, events)
@@ -231,11 +231,6 @@ def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     assert asked_m is not None
     spring_m = followed(reference_m, belief.mean_m, asked_m, belief.saturated, policy)
     return np.asarray(pose_of(belief.controller, spring_m, load)[0], float)
-
-
-def _error(belief: Belief, pose: np.ndarray, goal: np.ndarray) -> float:
-    """Return the weighted error of a pose (6,) at a goal (6,)."""
-    return float(np.linalg.norm(scaled_error(pose, goal, belief.controller.policy.reward)))
 
 
 def _clipped(shift: np.ndarray, limit: np.ndarray) -> np.ndarray:

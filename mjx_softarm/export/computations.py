@@ -12,7 +12,7 @@ from mjx_softarm.deploy.belief import as_without, on_reference, still, stuck_spr
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
-from mjx_softarm.mdp.rewards import asked_error, scaled_error
+from mjx_softarm.mdp.rewards import asked_error, weighted_error
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.reachable import distances
@@ -175,8 +175,7 @@ def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation
     without = as_without(policy.spring_model, at.pressure_kpa, at.spring_m, config, gains.allocation)
     # Error of a pose, and lengths that references make.
     pose = xp.asarray(at.pose, dtype=np.float64)
-    scaled = scaled_error(pose, at.goal, policy.reward)
-    weighted = xp.sqrt(xp.sum(scaled * scaled))
+    weighted = weighted_error(pose, at.goal, policy.reward)
     mean_m, asked_m = (symbol(name, at.spring_m.shape) for name in ("mean_m", "asked_m"))
     moved = at.reference_m, mean_m, asked_m, symbol("is_saturated", at.pressure_kpa.shape, bool)
     return {

@@ -67,6 +67,12 @@ def scaled_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
     return xp.asarray(list(config.weights), dtype=pose.dtype) * pose_error(pose, goal)
 
 
+def weighted_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
+    """Return the weighted error (...): the norm of `scaled_error`, with the same arguments."""
+    xp = array_namespace(pose)
+    return xp.sqrt(xp.sum(scaled_error(pose, goal, config) ** 2, axis=-1))
+
+
 def asked_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
     """Return pose - goal (..., 6) [mm, deg], angles wrapped, zero on axes that the goal does not ask for."""
     error = pose_error(pose, goal)
@@ -114,7 +120,7 @@ def reward(
     """
     # The paper's three cases exclude each other
     xp = array_namespace(pose)
-    norm = xp.sqrt(xp.sum(scaled_error(pose, goal, config) ** 2, axis=-1))
+    norm = weighted_error(pose, goal, config)
     close = norm < config.threshold
     reached = close & ~saturated
     on_the_way = ~close & ~saturated

@@ -15,11 +15,11 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import at_chambers, planes
-from mjx_softarm.mdp.rewards import scaled_error, weighted_angles, weighted_position
+from mjx_softarm.mdp.rewards import weighted_angles, weighted_error, weighted_position
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
-from mjx_softarm.sensing.s2r import apply_correction, correction, inputs
+from mjx_softarm.sensing.s2r import corrected
 
 N_STARTS, N_STEPS = 4, 20
 _DIFFERENCE = 1e-3  # step of the finite differences, as a share of the range of pressures
@@ -75,7 +75,7 @@ def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array
         better = square[:, start] < least
         best = xp.where(better[:, None], pose[:, start], best)
         least = xp.where(better, square[:, start], least)
-    return best, xp.sqrt(xp.sum(scaled_error(best, goal, policy.reward) ** 2, axis=-1))
+    return best, weighted_error(best, goal, policy.reward)
 
 
 def best_of(policy: Policy, goal: np.ndarray, search: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
     frame = estimate_frame(policy.estimator, spring_m, policy.spec.mass.payload_kg)
     if policy.s2r is None:
         return frame
-    return apply_correction(frame, correction(policy.s2r, inputs(frame, spring_m)))
+    return corrected(policy.s2r, frame, spring_m)
 
 
 def _springs(policy: Policy, share: Array) -> Array:

@@ -53,8 +53,12 @@ def correct(s2r: S2R, pose: Array, spring_m: Array) -> Array:
     Returns:
         Pose (..., 6) [mm, deg].
     """
-    frame = frame_from_pose(pose)
-    return pose_from_frame(*apply_correction(frame, correction(s2r, inputs(frame, spring_m))))
+    return pose_from_frame(*corrected(s2r, frame_from_pose(pose), spring_m))
+
+
+def corrected(s2r: S2R, frame: tuple[Array, Array], spring_m: Array) -> tuple[Array, Array]:
+    """Return the frame of the real tip: origin (..., 3) [m] and axes (..., 3, 3); see `correct`."""
+    return apply_correction(frame, correction(s2r, inputs(frame, spring_m)))
 
 
 def extrapolation(s2r: S2R, pose: Array, spring_m: Array) -> Array:

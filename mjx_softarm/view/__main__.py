@@ -117,14 +117,14 @@ def _view(
 
 
 def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Address) -> int:
-    from mjx_softarm.view.replay import Track, replay, share
+    from mjx_softarm.view.replay import Timeline, replay, share
 
-    tracks = [Track(path, spec) for path in logs]
+    timelines = [Timeline(path, spec) for path in logs]
     if html is not None:
-        speed = share(html, spec, tracks)
+        speed = share(html, spec, timelines)
         tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
         return 0
-    return replay(_served(at, ", ".join(track.name for track in tracks)), spec, tracks)
+    return replay(_served(at, ", ".join(timeline.name for timeline in timelines)), spec, timelines)
 
 
 def _errors(folders: tuple[Path, ...], html: Path | None, at: Address) -> int:

@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from typing import Any
 
 
-class End:
+class ChannelEnd:
     """One end of the channel."""
 
     def __init__(self, connection: Connection):

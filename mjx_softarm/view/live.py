@@ -26,7 +26,7 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.reachable import clamped
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.view.channel import End
+from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.look import look_at
 from mjx_softarm.view.taken_poses import TakenPoses
 
@@ -46,7 +46,7 @@ class PagePilot:
     goals cannot undo a stop.
     """
 
-    def __init__(self, end: End, arm: Any, controller: Controller, tell: Callable[[str], None]):
+    def __init__(self, end: ChannelEnd, arm: Any, controller: Controller, tell: Callable[[str], None]):
         self._end, self._arm, self._controller = end, arm, controller
         self._tell, self._said = tell, deque(maxlen=N_LINES)
         self._armed, self._payload_kg, self._n_pages, self._lost = False, 0.0, 0, False
@@ -167,7 +167,7 @@ def live(
     process = context.Process(target=serve, args=(theirs, setup), daemon=True)
     process.start()
     theirs.close()
-    end, controller = End(ours), Controller.of(setup.policy)
+    end, controller = ChannelEnd(ours), Controller.of(setup.policy)
     try:
         # Steer the arm, then save its poses and tell the end.
         ready(_address(end))
@@ -186,7 +186,7 @@ def live(
     return run
 
 
-def _address(end: End) -> str:
+def _address(end: ChannelEnd) -> str:
     """Return the page's address once it is served."""
     deadline_s = time.monotonic() + READY_S
     while time.monotonic() < deadline_s and not end.closed.wait(0.02):

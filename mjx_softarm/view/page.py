@@ -12,7 +12,7 @@ import viser
 
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
-from mjx_softarm.view.channel import End
+from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.look import Limits, Look
 from mjx_softarm.view.panel import BLUE, MUTED, Panel, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
@@ -37,7 +37,7 @@ class Setup(NamedTuple):
 def serve(connection: Connection, setup: Setup) -> None:
     """Serve the page until the loop's process ends; the loop handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end = End(connection)
+    end = ChannelEnd(connection)
     try:
         server = open_server(setup.host, setup.port, setup.arm)
     except OSError as error:
@@ -53,7 +53,7 @@ def serve(connection: Connection, setup: Setup) -> None:
 class Page:
     """One arm with gizmo, buttons, bars and traces, the same for all browsers."""
 
-    def __init__(self, server: viser.ViserServer, end: End, setup: Setup):
+    def __init__(self, server: viser.ViserServer, end: ChannelEnd, setup: Setup):
         self._server, self._end, self._hint = server, end, setup.hint
         self._known: dict[str, Any] = {"doing": "is not heard yet", "armed": False, "lines": ()}
         self._n_frames, self._heard_s, self._moved_s = 0, time.monotonic(), -DRAG_S

@@ -26,7 +26,7 @@ SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "10", "30")
 SHARE_HZ, SHARE_FRAMES = 10.0, 600  # frame rate; largest number of frames, so a longer log plays faster
 
 
-class Track:
+class Timeline:
     """One log on a time line that begins with its first row.
 
     Raises:
@@ -52,16 +52,16 @@ class Track:
 class ReplayPage:
     """Logs on a page, with a slider of time and a speed."""
 
-    def __init__(self, server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]):
-        self._server, self._tracks, self._traced_s = server, tracks, -np.inf
-        self._stages, end_s = _stages(server, spec, tracks), max(track.end_s for track in tracks)
+    def __init__(self, server: viser.ViserServer, spec: ArmSpec, timelines: Sequence[Timeline]):
+        self._server, self._timelines, self._traced_s = server, timelines, -np.inf
+        self._stages, end_s = _stages(server, spec, timelines), max(timeline.end_s for timeline in timelines)
         gui = server.gui
         self._play = gui.add_checkbox("play", True, order=0.0)
         self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1", order=0.1)
         self._time = gui.add_slider("time [s]", 0.0, max(end_s, FRAME_S), FRAME_S / 2, 0.0, order=0.1)
         self._panels = []
-        for track in tracks:
-            with gui.add_folder(track.name):
+        for timeline in timelines:
+            with gui.add_folder(timeline.name):
                 self._panels.append(Panel(gui, Limits.of(spec), spec.n_chambers))
         self._shown_s, self._end_s = -1.0, end_s
 
@@ -75,18 +75,18 @@ class ReplayPage:
             traced = abs(self._shown_s - self._traced_s) >= TRACES_S
             self._traced_s = self._shown_s if traced else self._traced_s
             with self._server.atomic():
-                for track, stage, panel in zip(self._tracks, self._stages, self._panels, strict=True):
-                    look = track.at(self._shown_s)
+                for timeline, stage, panel in zip(self._timelines, self._stages, self._panels, strict=True):
+                    look = timeline.at(self._shown_s)
                     stage.show(look)
                     if traced:
                         panel.show_bars(look)
                         panel.show_traces(look)
-                        panel.show_text(f"{look.time_s:.2f} s of {track.end_s:.1f} s", BLUE, look)
+                        panel.show_text(f"{look.time_s:.2f} s of {timeline.end_s:.1f} s", BLUE, look)
 
 
-def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> NoReturn:
+def replay(server: viser.ViserServer, spec: ArmSpec, timelines: Sequence[Timeline]) -> NoReturn:
     """Serve logs until Ctrl-C."""
-    page, before_s = ReplayPage(server, spec, tracks), time.monotonic()
+    page, before_s = ReplayPage(server, spec, timelines), time.monotonic()
     while True:
         now_s = time.monotonic()
         page.refresh(now_s - before_s)
@@ -94,17 +94,17 @@ def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) ->
         time.sleep(FRAME_S)
 
 
-def share(path: Path, spec: ArmSpec, tracks: Sequence[Track]) -> int:
+def share(path: Path, spec: ArmSpec, timelines: Sequence[Timeline]) -> int:
     """Write a page that plays logs without a server; return its speed, 1 or a larger integer."""
-    end_s = max(track.end_s for track in tracks)
+    end_s = max(timeline.end_s for timeline in timelines)
     speed = max(1, math.ceil(end_s * SHARE_HZ / SHARE_FRAMES))
     server = open_server("127.0.0.1", 8080, "")
-    stages = _stages(server, spec, tracks)
+    stages = _stages(server, spec, timelines)
     times_s = np.arange(0.0, end_s + 1e-9, speed / SHARE_HZ)
     recording = server.get_scene_serializer()
     for time_s in times_s:
-        for track, stage in zip(tracks, stages, strict=True):
-            stage.show(track.at(time_s))
+        for timeline, stage in zip(timelines, stages, strict=True):
+            stage.show(timeline.at(time_s))
         recording.insert_sleep(1.0 / SHARE_HZ)
     path.write_text(recording.as_html(), "utf-8")
     with contextlib.redirect_stdout(None):
@@ -112,11 +112,11 @@ def share(path: Path, spec: ArmSpec, tracks: Sequence[Track]) -> int:
     return speed
 
 
-def _stages(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> list[Stage]:
+def _stages(server: viser.ViserServer, spec: ArmSpec, timelines: Sequence[Timeline]) -> list[Stage]:
     """Set the scene; return a stage with a label for each log, side by side."""
-    set_the_scene(server, spec, APART_M * (len(tracks) - 1))
+    set_the_scene(server, spec, APART_M * (len(timelines) - 1))
     stages = []
-    for k, track in enumerate(tracks):
+    for k, timeline in enumerate(timelines):
         stages.append(Stage(server.scene, spec, Limits.of(spec), f"/arm{k}", (0.0, k * APART_M, 0.0)))
-        server.scene.add_label(f"/arm{k}/name", track.name, position=(0.0, 0.0, 0.09))
+        server.scene.add_label(f"/arm{k}/name", timeline.name, position=(0.0, 0.0, 0.09))
     return stages

@@ -87,10 +87,10 @@ def test_goal_is_dragged_and_the_arm_stopped_and_vented(browser, live):
 
 
 def test_shared_file_plays_without_a_server(browser, tmp_path):
-    from mjx_softarm.view.replay import Track, share
+    from mjx_softarm.view.replay import Timeline, share
 
     write_log(tmp_path / "run.csv", go(LinearArm(), goals=GOALS[:1], duration_s=2.0).log)
-    share(tmp_path / "run.html", SPEC, [Track(tmp_path / "run.csv", SPEC)])
+    share(tmp_path / "run.html", SPEC, [Timeline(tmp_path / "run.csv", SPEC)])
     context = browser.new_context(offline=True, viewport={"width": 500, "height": 400})
     page, errors = context.new_page(), []
     page.on("pageerror", lambda error: errors.append(error))

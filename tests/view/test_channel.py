@@ -6,7 +6,7 @@ from multiprocessing import Pipe
 import numpy as np
 import pytest
 
-from mjx_softarm.view.channel import End
+from mjx_softarm.view.channel import ChannelEnd
 
 
 def wait_for(condition, seconds=10.0):
@@ -26,7 +26,7 @@ def taken(end, name):
 @pytest.fixture
 def ends():
     ours, theirs = Pipe()
-    return End(ours), theirs
+    return ChannelEnd(ours), theirs
 
 
 def test_channel_keeps_the_newest_of_each_name(ends):

@@ -12,7 +12,7 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.goals import Orders
 from mjx_softarm.deploy.loop import Tick, start, with_goal
 from mjx_softarm.deploy.session import steer
-from mjx_softarm.view.channel import End
+from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.live import PagePilot, place_poses
 from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm
 
@@ -20,7 +20,7 @@ from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm
 @pytest.fixture
 def ends():
     ours, theirs = Pipe()
-    return End(ours), theirs
+    return ChannelEnd(ours), theirs
 
 
 class Inbox:

@@ -7,7 +7,7 @@ from multiprocessing import Pipe
 import numpy as np
 import pytest
 
-from mjx_softarm.view.channel import End
+from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.look import look_at
 from tests.linear_arm import GOALS, POLICY, REST_M, SPEC, N
 
@@ -47,7 +47,7 @@ class Client:
 def page(server):
     """The page, and the loop's end of its channel."""
     ours, theirs = Pipe()
-    return Page(server, End(theirs), Setup(POLICY, "arm", "127.0.0.1", 8420, True)), End(ours)
+    return Page(server, ChannelEnd(theirs), Setup(POLICY, "arm", "127.0.0.1", 8420, True)), ChannelEnd(ours)
 
 
 def until(end, name, seconds=10.0):

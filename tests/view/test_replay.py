@@ -9,7 +9,7 @@ from tests.linear_arm import GOALS, SPEC, LinearArm, go
 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
 from mjx_softarm.view.__main__ import main
-from mjx_softarm.view.replay import SHARE_HZ, ReplayPage, Track, share
+from mjx_softarm.view.replay import SHARE_HZ, ReplayPage, Timeline, share
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def path(tmp_path_factory):
 
 
 def test_track_shows_the_row_of_a_time(path):
-    track = Track(path, SPEC)
+    track = Timeline(path, SPEC)
     assert track.end_s == pytest.approx(1.98) and track.name == "run.csv"
     assert track.at(-1.0).time_s == 0.0 and track.at(1e9).time_s == pytest.approx(1.98)
     assert track.at(0.51).time_s == pytest.approx(0.50)
@@ -31,14 +31,14 @@ def test_track_goes_without_rows_out_of_order(path, tmp_path):
     header, *rows = path.read_text().splitlines()
     rows[10], rows[20] = "nan" + rows[10][rows[10].index(",") :], rows[3]
     (tmp_path / "a.csv").write_text("\n".join([header, *rows]))
-    assert Track(tmp_path / "a.csv", SPEC).at(0.41).time_s == pytest.approx(0.38)
+    assert Timeline(tmp_path / "a.csv", SPEC).at(0.41).time_s == pytest.approx(0.38)
     (tmp_path / "b.csv").write_text(header + "\n" + "nan" + rows[0][rows[0].index(",") :])
     with pytest.raises(InputError, match=r"b\.csv: got no rows, expected some"):
-        Track(tmp_path / "b.csv", SPEC)
+        Timeline(tmp_path / "b.csv", SPEC)
 
 
 def test_replay_plays_at_its_speed_pauses_and_begins_anew(path, server):
-    page = ReplayPage(server, SPEC, [Track(path, SPEC), Track(path, SPEC)])
+    page = ReplayPage(server, SPEC, [Timeline(path, SPEC), Timeline(path, SPEC)])
     page.refresh(0.5)
     page._speed.value = "2"
     page.refresh(0.5)
@@ -53,7 +53,7 @@ def test_replay_plays_at_its_speed_pauses_and_begins_anew(path, server):
 
 def test_long_log_is_shared_faster(path, tmp_path, monkeypatch):
     monkeypatch.setattr("mjx_softarm.view.replay.SHARE_FRAMES", 7)
-    assert share(tmp_path / "run.html", SPEC, [Track(path, SPEC)]) == int(np.ceil(1.98 * SHARE_HZ / 7))
+    assert share(tmp_path / "run.html", SPEC, [Timeline(path, SPEC)]) == int(np.ceil(1.98 * SHARE_HZ / 7))
     text = (tmp_path / "run.html").read_text()
     assert "__VISER_EMBED_DATA__" in text and text.rstrip().endswith("</html>")
 

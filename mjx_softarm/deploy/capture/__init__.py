@@ -30,7 +30,7 @@ from mjx_softarm.deploy.accuracy.measure import LOOK_S, LOOKS
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.capture.natnet import NatNet
 from mjx_softarm.deploy.capture.qualisys import Qualisys
-from mjx_softarm.deploy.capture.system import UP, CaptureName, Frame, Source
+from mjx_softarm.deploy.capture.system import UP, CaptureFrame, CaptureName, Source
 from mjx_softarm.deploy.link import describe
 from mjx_softarm.posture import straight_pose
 from mjx_softarm.sensing.pose import (
@@ -117,7 +117,7 @@ class CapturedArm:
         sent = f"frames were sent {1e3 * known.mean():.1f} ms after the exposure, " if len(known) else ""
         return f"{line}; {sent}at most {1e3 * max(self._delay_s):.0f} ms later than the fastest"
 
-    def _newest(self) -> Frame | None:
+    def _newest(self) -> CaptureFrame | None:
         """Return the newest frame since the last call; None without one, or if it may be an old one."""
         frame, now_s = self._source.poll(), time.monotonic()
         if frame is None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm._support.errors import needing
-from mjx_softarm.deploy.capture.system import CaptureName, Frame, check_names
+from mjx_softarm.deploy.capture.system import CaptureFrame, CaptureName, check_names
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 
 COMMAND_PORT, DATA_PORT = 1510, 1511
@@ -66,7 +66,7 @@ class NatNet:
         check_names(where, "marker set", name.markers, sorted(sets))
         self._n_markers = sets.get(name.markers, 0)
 
-    def poll(self) -> Frame | None:
+    def poll(self) -> CaptureFrame | None:
         """Return the newest frame since the last call, None without one, at once; see `Source`."""
         self._read()
         frame, now_s = self._new[-1] if self._new else None, time.monotonic()
@@ -132,7 +132,7 @@ class NatNet:
     def _on_descriptions(self, described: Any) -> None:
         self._described = described
 
-    def _frame(self, frame: Any) -> Frame:
+    def _frame(self, frame: Any) -> CaptureFrame:
         names = {body.id_num: body.name for body in self._described.rigid_bodies}
         bodies = {
             names[body.id_num]: (
@@ -147,7 +147,7 @@ class NatNet:
             if found.model_name == self._name.markers and len(found.marker_pos_list) == self._n_markers:
                 marker_m = np.array(found.marker_pos_list).reshape(-1, 3)
         marker_m[(marker_m == 0.0).all(axis=1)] = np.nan  # a hidden marker stands at the origin
-        return Frame(frame.suffix.timestamp, self._latency(frame.suffix), bodies, marker_m)
+        return CaptureFrame(frame.suffix.timestamp, self._latency(frame.suffix), bodies, marker_m)
 
     def _latency(self, end: Any) -> float:
         """Return the time [s] from exposure to sending; NaN where the clock's rate is not known yet.

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm._support.errors import needing
-from mjx_softarm.deploy.capture.system import CaptureName, Frame, check_names, numbered
+from mjx_softarm.deploy.capture.system import CaptureFrame, CaptureName, check_names, numbered
 
 PORT = 22223  # of the protocol with little-endian numbers
 VERSION = "1.25"  # of the protocol
@@ -52,7 +52,7 @@ class Qualisys:
             self.close()
             raise
 
-    def poll(self) -> Frame | None:
+    def poll(self) -> CaptureFrame | None:
         """Return the newest frame since the last call, None without one, at once; see `Source`."""
         # Let the loop take what has come; a lost connection is begun again beside it.
         if not self._connected() and (self._task is None or self._task.done()):
@@ -140,7 +140,7 @@ class Qualisys:
     def _on_packet(self, packet: Any) -> None:
         self._packet = packet
 
-    def _frame(self, packet: Any) -> Frame:
+    def _frame(self, packet: Any) -> CaptureFrame:
         poses = (packet.get_6d() or (None, []))[1]
         bodies = {
             body: (1e-3 * np.array(place), np.reshape(turn.matrix, (3, 3)).T)
@@ -150,4 +150,4 @@ class Qualisys:
         marker_m = np.full((len(self._markers), 3), np.nan)
         if self._markers and (markers := packet.get_3d_markers()):
             marker_m = 1e-3 * np.array(markers[1], float)[self._markers]
-        return Frame(1e-6 * packet.timestamp, math.nan, bodies, marker_m)
+        return CaptureFrame(1e-6 * packet.timestamp, math.nan, bodies, marker_m)

@@ -16,7 +16,7 @@ UP = {"y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), "z": 
 _DEFAULT_UP = {"natnet": "y", "qualisys": "z"}
 
 
-class Frame(NamedTuple):
+class CaptureFrame(NamedTuple):
     """A frame in the axes of its system.
 
     Attributes:
@@ -35,7 +35,7 @@ class Frame(NamedTuple):
 class Source(Protocol):
     """A connection to a motion capture system."""
 
-    def poll(self) -> Frame | None:
+    def poll(self) -> CaptureFrame | None:
         """Return the newest frame since the last call, None without one, at once.
 
         Raises:
