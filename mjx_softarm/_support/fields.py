@@ -28,8 +28,8 @@ class Rule:
     low: float = -math.inf
     high: float = math.inf
     low_open: bool = False
-    per: str = ""  # parts of the arm with a number each, such as "chambers"; one for all without `length`
-    length: int | None = None  # length of a field that must be a list; 0: it depends on the arm
+    per: str = ""  # parts that may have a number each, such as "chambers"
+    length: int | None = None  # length of a field that must be a list; 0: one number for each part
     why: str = ""  # reason for the lower bound
 
     @property

@@ -17,7 +17,7 @@ Note = Callable[[Sequence[Event]], None]
 
 
 class ListedGoals:
-    """Goals one after the other, as `follow` takes them; those of `refused`, by index, are skipped."""
+    """Goals one after the other, as `follow` takes them; goals in `refused`, by index, are skipped."""
 
     ways = ()  # rows of the log in which the goal moved
 

@@ -75,7 +75,7 @@ def trace(
         goals (p, 6) [mm, deg]: poses; between two of them the goal moves on a straight line.
         pace_s: time from a goal to the next.
         stops (p,): bool; the first and the last goal are stops in any case.
-        tell, arrived, save: as of `follow`, for stops.
+        tell, arrived, save: as for `follow`; stops are the goals that count.
     """
     refused = refusals(controller.policy, list(goals))
     way = Way(controller, goals, np.broadcast_to(stops, len(goals)), pace_s, refused)
@@ -89,7 +89,7 @@ def steer(
     tell: Callable[[str], None] = lambda text: None,
     save: Callable[[Log], None] | None = None,
 ) -> LoopRun:
-    """Steer an `ArmIO` by a pilot's orders until something ends the run, then vent; arguments as of `follow`.
+    """Steer an `ArmIO` by a pilot's orders until something ends the run, then vent; see `follow`.
 
     Without `save` only the newest rows, arrivals and faults are kept: the run may last for days.
     """

@@ -29,8 +29,8 @@ def policy_from_actor(
 
     Args:
         actor_params: as flax initialises the actor, `{"params": {"hidden_0": {"kernel", "bias"}, ...,
-            "head": {"kernel", "bias"}}}`; the head's first n outputs are the mean, as many more the log
-            standard deviation.
+            "head": {"kernel", "bias"}}}`. The head's first n outputs are the mean action, the others the
+            logarithms of its standard deviations.
         spec: the arm; scales, limits, calibration and gains are its own, as in the environment.
         reward: the environment's.
         model: networks and workspace of the arm.
@@ -59,7 +59,7 @@ def policy_from_actor(
 
 
 def check_actor(actor_params: Mapping[str, Any], spec: ArmSpec) -> None:
-    """Raise ValueError where the parameters, as of `policy_from_actor`, are not those of an actor."""
+    """Raise ValueError where the parameters, as for `policy_from_actor`, are not those of an actor."""
     _layers_from_flax(actor_params, spec.n_springs)
 
 

@@ -58,7 +58,7 @@ class ShapeLag(NamedTuple):
     uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first pose
 
     def after(self, policy: Policy, spring_m: np.ndarray, pose: np.ndarray, dt_s: float) -> ShapeLag:
-        """Return the memory a time dt_s later, with springs (n_springs,) [m] whose pose at rest is (6,)."""
+        """Return the memory a time dt_s later, at springs (n_springs,) [m] and their pose at rest (6,)."""
         uneven = self._at_rest(policy, spring_m, pose)
         if self.uneven is None:
             return ShapeLag(uneven)
@@ -66,7 +66,7 @@ class ShapeLag(NamedTuple):
         return ShapeLag(self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven))
 
     def behind(self, policy: Policy, spring_m: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Return the pose (6,) [mm, deg] at rest less that in motion; arguments as of `after`."""
+        """Return the pose (6,) [mm, deg] at rest minus the pose in motion; arguments as for `after`."""
         uneven = self._at_rest(policy, spring_m, pose)
         return np.zeros(6) if self.uneven is None else pose_error(uneven, self.uneven)
 
@@ -80,7 +80,7 @@ class ShapeLag(NamedTuple):
 class WayRule(NamedTuple):
     """Numbers by which `WayError` corrects the goal."""
 
-    reward: RewardConfig  # whose axes goals ask for
+    reward: RewardConfig  # its weights say which axes a goal asks for
     dt_s: float  # duration of a tick
     lead_s: float  # time by which the goal is given ahead of its time
     share_per_s: float  # share of the error that the correction takes up in a second
@@ -88,10 +88,10 @@ class WayRule(NamedTuple):
 
 
 class WayError(NamedTuple):
-    """Memory of a tip's errors on the way of a moving goal, and the correction of the goal that they ask for.
+    """Memory of the tip's errors behind a moving goal, and the correction of the goal.
 
-    The correction integrates the believed errors. It turns with the way: an error along the way, such as a
-    lag, and one across it stay nearly constant on a bend.
+    The correction integrates the believed errors. It turns with the direction of the way, in which errors
+    along the way, such as a lag, and across it stay nearly constant on a bend.
     """
 
     goals: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] of each tick, from the one two ticks ago to the lead

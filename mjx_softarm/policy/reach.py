@@ -25,7 +25,7 @@ N_STARTS, N_STEPS = 4, 20
 _DIFFERENCE = 1e-3  # step of the finite differences, as a share of the range of pressures
 _EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after a step that did not
 _LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e-3, 1e3
-_STAYING = 1e-4  # weight of a chamber that does not follow, beside the ones that do
+_STAYING = 1e-4  # weight of a chamber that does not follow; chambers that follow have 1
 
 
 def nearest_poses(policy: Policy, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,10 +141,9 @@ def solved(matrix: Array, column: Array) -> Array:
 def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array, policy: Policy) -> Array:
     """Return the lengths (n_springs,) [m] that an arm at rest takes for new references. NumPy and symbols.
 
-    The lengths are the references: springs of an arm at rest may creep by some tenths of a millimetre. But
-    saturated chambers that are asked for more do not follow: there the lengths are the springs'. Of an arm
-    with redundant chambers, each section takes the plane that fits the chambers which follow, and the others
-    as far as these leave it open.
+    The lengths are the references, except at saturated chambers that are asked for more: they do not follow,
+    and their springs keep their lengths. With redundant chambers, each section takes the plane that fits the
+    chambers which follow; the others only decide what these leave open.
 
     Args:
         reference_m (n_springs,) [m]: new references.

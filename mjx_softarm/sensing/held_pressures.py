@@ -1,18 +1,18 @@
 """Pressures that hold a calibrated arm at rest, less those of its simulation: a process for each section.
 
-Chambers harden, and their areas grow with pressure, as those of the simulation do not. How much depends on a
-section's own springs and pressures, whatever hangs below it. So the residual of the c chambers of a section
-is a Gaussian process of the section's state u: its spring lengths and simulated pressures, standardised. With
-the covariance V (c, c) between chambers,
+Real chambers harden, and their areas grow with pressure; those of the simulation do not. The residual depends
+on a section's own springs and pressures, not on the load below it. So the residual of the c chambers of a
+section is a Gaussian process of the section's state u: its spring lengths and simulated pressures,
+standardised. With the covariance V (c, c) between chambers,
 
     cov(r(u), r(u')) = k(u, u') V,    k = 1 + u.u' + exp(-|u - u'|^2 / (2 l^2)) + noise where u = u'.
 
 A payload is told from pressures: about 4 kPa of the paper's arm for each kilogram. The mean of the process
 corrects them. Its variance tells how well a payload is known: it is large far from the poses of the log.
 
-A payload changes a chamber's pressure by a factor of what the simulation says. The log of an unloaded arm
-does not tell it: with all stiffnesses, areas and masses greater by the same share, it would be the same log.
-So the factors are normal about 1, with the deviations below.
+A payload changes a chamber's pressure by the simulated change times a factor. The log of an unloaded arm does
+not show this factor: with all stiffnesses, areas and masses greater by the same share, the log is the same.
+So the factors are normally distributed about 1, with the deviations below.
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
@@ -42,7 +42,7 @@ class HeldPressures(NamedTuple):
     scale: np.ndarray  # (s, d) [m, kPa] divided by
     residual_kpa: np.ndarray  # (n, s, c) measured minus simulated pressures
     length: np.ndarray  # (s,) distance of states over which the residual changes
-    noise: np.ndarray  # (s,) variance of what no state explains, over V
+    noise: np.ndarray  # (s,) variance that no state explains, as a multiple of V
     covariance_kpa2: np.ndarray  # (s, c, c) V
 
 
@@ -50,7 +50,7 @@ class Residual(NamedTuple):
     """Posterior of the residual pressures of m arms at rest without a payload."""
 
     mean_kpa: np.ndarray  # (m, s, c)
-    share: np.ndarray  # (m, s) variance, noise included, over V
+    share: np.ndarray  # (m, s) variance, noise included, as a multiple of V
 
 
 def factor_covariance(n: int) -> np.ndarray:
@@ -72,7 +72,7 @@ def held_kpa(
         spring_m (m, n_springs) [m]: spring lengths.
         light_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm there without a payload.
         effect_kpa (m, n_chambers) [kPa]: change of these pressures by the arm's payload.
-        rng: generator that draws for each arm what the log does not tell; without one, means are returned.
+        rng: generator of residuals and factors for each arm; without one, means are returned.
     """
     found = residual(held, spring_m, light_kpa)
     left_kpa, factor = found.mean_kpa, 1.0

@@ -2,10 +2,11 @@
 
 A payload bends and stretches the arm, and the sensor-space law holds the springs where they were. So springs
 alone do not show a payload; springs and pressures do. A small network estimates the payload. It is distilled
-from equilibria of simulated arms whose pressures differ from the calibrated arm's as its calibration leaves
-them unknown. A second network gives the standard deviation of the estimate. A payload changes rarely, so
-estimates are averaged, until two in a row disagree with the average. Errors of neighbouring poses are alike:
-an average is taken to be known no better than its estimates.
+from equilibria of simulated arms. Their pressures differ from the calibrated arm's by as much as the
+calibration leaves unknown. A second network gives the standard deviation of the estimate.
+
+A payload changes rarely, so estimates are averaged, until two in a row disagree with the average. Errors of
+neighbouring poses are alike, so an average counts as no more certain than its estimates.
 """
 
 from __future__ import annotations

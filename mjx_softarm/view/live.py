@@ -129,7 +129,7 @@ def place_poses(spec: ArmSpec) -> np.ndarray:
 
 
 def _doing(state: LoopState, n_actions: int) -> str:
-    """Return what the arm does, as the predicate of a sentence."""
+    """Return the arm's activity as words that follow "the arm"."""
     if state.goal is not None:
         return f"moves (action {max(state.strategy.n_actions, 1)} of {n_actions})"
     if state.command.reference_m is None:

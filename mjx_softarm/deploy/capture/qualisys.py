@@ -21,8 +21,8 @@ import numpy as np
 from mjx_softarm._support.errors import needing
 from mjx_softarm.deploy.capture.system import CaptureFrame, CaptureName, check_names, numbered
 
-PORT = 22223  # of the protocol with little-endian numbers
-VERSION = "1.25"  # of the protocol
+PORT = 22223  # port of the protocol with little-endian numbers
+VERSION = "1.25"  # version of the protocol
 WAIT_S = 3.0  # longest wait for QTM's answers
 AGAIN_S = 2.0  # time between two tries to reach a server that has gone
 
@@ -41,9 +41,9 @@ class Qualisys:
         logging.getLogger("qtm_rt").addHandler(logging.NullHandler())  # this class tells its errors
         self._name = name
         self._host = socket.gethostbyname(name.host)  # looked up once, not in the loop
-        self._error: Exception | None = None  # of the last try to connect again
+        self._error: Exception | None = None  # error of the last try to connect again
         self._connection: Any = None
-        self._packet: Any = None  # the newest that has not been taken
+        self._packet: Any = None  # newest packet that was not taken yet
         self._loop = asyncio.new_event_loop()
         self._task: asyncio.Task | None = None
         try:

@@ -1,4 +1,4 @@
-"""A motion capture system: the option that names it, its frames, and what it has to offer."""
+"""Motion capture systems: the option that names one, its frames, and checks of names."""
 
 from __future__ import annotations
 

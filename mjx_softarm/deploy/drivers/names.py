@@ -1,8 +1,12 @@
-"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, `twin:rod:SEED`, `wiring.toml`, or `package.module:Class`.
+"""Arms by name.
 
-`twin:SEED@ARM` and `twin:rod:SEED@ARM` are twins of another arm, named as for `--spec`. A twin's name that
-ends in `:500g` has a payload of 500 g. With `:aged` before that, it is the same arm some months later: each
-spring's zero is 1 mm off, and the chambers are 5 % softer.
+    package.module:Class   a driver
+    wiring.toml            hardware by its settings (`mjx_softarm.deploy.drivers.wiring`)
+    twin:SEED              a twin; `twin:rod:SEED` is a rod; `twin:SEED@ARM` has another arm, as for `--spec`
+
+Options follow a twin's name, in this order: `:pipe300` or `:pipe250` puts it into a pipe. `:aged` is the same
+arm some months later: each spring's zero is 1 mm off, and the chambers are 5 % softer. `:lost4` takes the
+pressure of chamber 4. `:500g` hangs a payload of 500 g to it.
 """
 
 from __future__ import annotations
@@ -27,11 +31,8 @@ def open_arm(name: str) -> Any:
     """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
-        name: `twin:SEED`; a rod, `twin:rod:SEED`; of another arm, `twin:SEED@ARM`, `twin:rod:SEED@ARM`; in a
-            pipe, `twin:SEED:pipe300` or `twin:SEED:pipe250`; later, `twin:SEED:aged`; each with a payload as
-            in `twin:SEED:500g`. Or a file of hardware and settings, `wiring.toml`
-            (`mjx_softarm.deploy.drivers.wiring`). Or `package.module:Class`, a class without arguments;
-            modules may be in the working directory.
+        name: a name as this module describes them. A class has no arguments; its module may be in the
+            working directory.
 
     Raises:
         InputError: the name is malformed, cannot be imported, or is no arm.

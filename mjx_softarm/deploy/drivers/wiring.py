@@ -54,7 +54,7 @@ class Wired:
 
 
 def _line(kind: type) -> Callable[..., Any]:
-    """Return what opens a line driver whose numbers are class attributes."""
+    """Return a function that opens a line driver; its settings are class attributes of the driver."""
 
     def open_line(**settings: Any) -> Any:
         known = {name for base in kind.__mro__ for name in vars(base) if not name.startswith("_")}
