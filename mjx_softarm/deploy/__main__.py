@@ -23,7 +23,6 @@ from mjx_softarm.deploy.accuracy.measure import (
     figures,
     measure,
     read_goals,
-    require_motion_capture,
     whole_goal,
     write_accuracy,
 )
@@ -32,6 +31,7 @@ from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.drivers.driven import Arms, finish
 from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
 from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
+from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.logs import mcap_file
@@ -159,7 +159,7 @@ def _measure(
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
     driver = on.open(controller.policy.spec, tell)
-    require_motion_capture(driver, f"--arm: {on.arm}")
+    first_frame(driver, f"--arm: {on.arm}")
     check_arm(driver, controller, f"--arm {on.arm}")
 
     # The run, stop by stop or in time

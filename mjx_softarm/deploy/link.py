@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.arm_io import ArmIO, Capture
 from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.sensors import Sensor
@@ -27,6 +28,7 @@ from mjx_softarm.spec import ArmSpec
 
 VENT_KPA_PER_S = 20.0  # ramp to zero; by hand
 VENT_TRIES = 250  # failed writes in a row after which the arm counts as not vented; some 5 s, by hand
+LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
 
 
 def vented(pressure_kpa: Array, dt_s: float) -> Array:
@@ -184,6 +186,25 @@ def describe(error: BaseException) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1:]
     where = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in place)
     return ": ".join(filter(None, [type(error).__name__, text])) + where
+
+
+def first_frame(arm: Any, where: str) -> Capture:
+    """Return the first frame of motion capture with the tip; look for it for a second at most.
+
+    Raises:
+        InputError: there is none; the message begins with `where`.
+    """
+    why = "an arm without the method motion_capture"
+    for _ in range(LOOKS if hasattr(arm, "motion_capture") else 0):
+        try:
+            seen = arm.motion_capture()
+            if np.isfinite(seen.tip_m).all():
+                return seen
+            why = "motion capture that does not see the tip"
+        except Exception as error:  # a driver may raise anything
+            why = f"no frame of motion capture: {describe(error)}"
+        time.sleep(LOOK_S)
+    raise InputError(f"{where}: got {why}, expected a frame with the tip within {LOOKS * LOOK_S:g} s")
 
 
 def stacked(rows: Collection[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from mjx_softarm._support.files import read_json_lines
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 from mjx_softarm.view.look import Limits, look_at
-from mjx_softarm.view.panel import MUTED, css, plot
+from mjx_softarm.view.panel import MUTED, add_box, css, plot
 from mjx_softarm.view.stage import SATURATED, Stage, set_the_scene
 
 CONFIG_FILE, METRICS_FILE = "config.json", "metrics.jsonl"  # files of a run
@@ -92,7 +92,9 @@ class Errors:
     def _show(self, name: str, pairs: PosePairs) -> None:
         target_m, pose_m = 1e-3 * pairs.target[:, :3], 1e-3 * pairs.pose[:, :3]
         if name not in self._boxes:
-            self._add_box(name)
+            node = self._server.scene.add_frame(f"/{name}", show_axes=False)
+            with self._sets:
+                self._boxes[name] = add_box(self._server.gui, name, True, node)
         colour = colours(pairs.error_mm)
         looks = {"point_size": _POINT_M, "point_shape": "circle"}
         scene = self._server.scene
@@ -105,14 +107,6 @@ class Errors:
             scene.add_point_cloud(f"/{name}/warned", target_m[pairs.warned], _WARNED, **looks)
         else:
             scene.remove_by_name(f"/{name}/warned")
-
-    def _add_box(self, name: str) -> None:
-        """Add a check box that shows a set, by the visibility of its frame."""
-        node = self._server.scene.add_frame(f"/{name}", show_axes=False)
-        with self._sets:
-            box = self._server.gui.add_checkbox(name, True)
-        box.on_update(lambda _: setattr(node, "visible", box.value))
-        self._boxes[name] = box
 
     def _show_curves(self) -> None:
         rows = read_json_lines(self._folder / METRICS_FILE)

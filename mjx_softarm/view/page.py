@@ -14,7 +14,7 @@ from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
 from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.look import Limits, Look
-from mjx_softarm.view.panel import BLUE, MUTED, Panel, css
+from mjx_softarm.view.panel import BLUE, MUTED, Panel, add_box, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
 
 FRAME_S, BARS, TRACES = 0.02, 5, 10  # time between frames; frames between bars, and between traces
@@ -81,8 +81,8 @@ class Page:
                 button("Take the pose", "take", "Take the pose at rest as a demonstration", icon.CAMERA)
             if setup.carries:
                 self._add_payload(round(1e3 * spec.mass.largest_payload_kg))
-            self._box("reachable poses", "Goals are kept near them", points)
-            self._box("reachable workspace", "The hull of the reachable poses", hull)
+            add_box(server.gui, "reachable poses", False, points, "Goals are kept near them")
+            add_box(server.gui, "reachable workspace", False, hull, "The hull of the reachable poses")
         self._listen()
 
     def _button(self, label: str, name: str, hint: str, icon: Any, colour: Any = None) -> None:
@@ -92,11 +92,6 @@ class Page:
         @button.on_click
         async def _(_: Any) -> None:  # in the server's own thread, so that it waits for nobody
             self._end.put(**{name: True})
-
-    def _box(self, label: str, hint: str, node: viser.SceneNodeHandle) -> None:
-        """Add a check box that shows a node of the scene."""
-        box = self._server.gui.add_checkbox(label, False, hint=hint)
-        box.on_update(lambda _: setattr(node, "visible", box.value))
 
     def _add_payload(self, largest_g: int) -> None:
         hint, step_g = "Hung to the finger tips", max(largest_g // 20, 1)

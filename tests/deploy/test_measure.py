@@ -14,11 +14,11 @@ from mjx_softarm.deploy.accuracy.measure import (
     grid_poses,
     measure,
     read_goals,
-    require_motion_capture,
     write_accuracy,
 )
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.ending import DONE, MISSED
+from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
@@ -84,8 +84,8 @@ class Dark(Seen):
 
 
 def test_motion_capture_is_looked_at_before_the_arm_moves(monkeypatch):
-    monkeypatch.setattr("mjx_softarm.deploy.accuracy.measure.LOOK_S", 0.0)
-    require_motion_capture(Dark(3), "--arm")
+    monkeypatch.setattr("mjx_softarm.deploy.link.LOOK_S", 0.0)
+    first_frame(Dark(3), "--arm")
     unseen = Dark(0)
     unseen.off_mm = np.nan * OFF_MM
     for arm, message in (
@@ -94,7 +94,7 @@ def test_motion_capture_is_looked_at_before_the_arm_moves(monkeypatch):
         (unseen, "--arm: got motion capture that does not see the tip, expected a frame"),
     ):
         with pytest.raises(InputError, match=message):
-            require_motion_capture(arm, "--arm")
+            first_frame(arm, "--arm")
     run = go(Dark(10**6), goals=GOALS[:1])
     assert run.arrivals
     with pytest.raises(InputError, match=r"motion capture: got no frame in [0-9]+ ticks"):

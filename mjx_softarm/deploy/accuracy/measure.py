@@ -6,7 +6,6 @@ Each error is the mean over the window in which the springs had settled, since m
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,6 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import Arrival, LoopRun
-from mjx_softarm.deploy.link import describe
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
@@ -25,7 +23,6 @@ from mjx_softarm.policy.file import Policy
 from mjx_softarm.posture import posture, straight_pose
 from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame, rotation_about, seen_error
 
-LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
 MOST_LAG_S = 3.0  # largest lag of a tip behind a moving goal that is looked for
 POSE_NAMES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll [deg]")
@@ -96,24 +93,6 @@ def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
             break
         chosen = order[first]
     return np.asarray(workspace[chosen], float)
-
-
-def require_motion_capture(arm: Any, where: str) -> None:
-    """Check for a second at most that motion capture sees the tip.
-
-    Raises:
-        InputError: it does not; the message begins with `where`.
-    """
-    why = f"{where}: got an arm without the method motion_capture"
-    for _ in range(LOOKS if hasattr(arm, "motion_capture") else 0):
-        try:
-            if np.isfinite(arm.motion_capture().tip_m).all():
-                return
-            why = f"{where}: got motion capture that does not see the tip"
-        except Exception as error:  # a driver may raise anything
-            why = f"{where}: got no frame of motion capture: {describe(error)}"
-        time.sleep(LOOK_S)
-    raise InputError(f"{why}, expected a frame with the tip")
 
 
 def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy:

@@ -26,12 +26,11 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.accuracy.measure import LOOK_S, LOOKS
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.capture.natnet import NatNet
 from mjx_softarm.deploy.capture.qualisys import Qualisys
 from mjx_softarm.deploy.capture.system import UP, CaptureFrame, CaptureName, Source
-from mjx_softarm.deploy.link import describe
+from mjx_softarm.deploy.link import describe, first_frame
 from mjx_softarm.posture import straight_pose
 from mjx_softarm.sensing.pose import (
     frame_from_pose,
@@ -182,23 +181,11 @@ def with_capture(arm: Any, name: str | None, spec: ArmSpec, tell: Callable[[str]
         raise InputError(f"{where}: {describe(error)}") from error
     captured = CapturedArm(arm, source, read, tell)
     try:
-        _check_place(_first(captured, where), spec, where)
+        _check_place(first_frame(captured, where), spec, where)
     except InputError:
         source.close()
         raise
     return captured
-
-
-def _first(arm: CapturedArm, where: str) -> Capture:
-    """Return the first frame with the tip; look for a second at most."""
-    why = "got no frame"
-    for _ in range(LOOKS):
-        try:
-            return arm.motion_capture()
-        except OSError as error:
-            why = str(error)
-            time.sleep(LOOK_S)
-    raise InputError(f"{where}: {why}, expected one with the tip within {LOOKS * LOOK_S:g} s")
 
 
 def _check_place(seen: Capture, spec: ArmSpec, where: str) -> None:

@@ -142,7 +142,7 @@ def test_a_body_that_is_not_seen_at_first_is_refused(system, serve, opened):
     scene = scene_of()
     scene.hidden = {"tip"}
     serve(system, scene)
-    with pytest.raises(InputError, match="got .*'tip', expected one with the tip within 1 s"):
+    with pytest.raises(InputError, match="got .*'tip', expected a frame with the tip within 1 s"):
         opened(f"{system}:127.0.0.1:tip,base=base,up=z")
 
 
