@@ -9,7 +9,8 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from train.agent.analytic import AnalyticConfig
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
-from train.agent.imitation import GoalStage, ImitationConfig
+from train.agent.imitation import ImitationConfig
+from train.agent.stages import GoalStage
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 

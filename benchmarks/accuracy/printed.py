@@ -76,14 +76,14 @@ CASES = {
 class PrintedSettings:
     """Further settings of the runs."""
 
-    pipe_env_steps: int | None = None  # of the pipe's runs; None: the preset's
+    env_steps: int | None = None  # of each run; None: the preset's
 
 
 def measure(
     out: Path = Path("runs/printed"),
     seeds: cli.Integers = (0, 1, 2),
     cases: Annotated[tuple[str, ...], names_of(CASES)] = tuple(CASES),
-    pipe_env_steps: int | None = None,
+    env_steps: int | None = None,
 ) -> dict[str, Any]:
     """Does the paper's recipe work as printed, in simulation, and what does each change to it bring?
 
@@ -93,7 +93,7 @@ def measure(
         out: working folder: the same command continues, and seeds and cases may be added
         seeds: of training; changes have the first alone
         cases: which; None: all
-        pipe_env_steps: of each run in the pipe; None: a million, as in the paper
+        env_steps: of each run, with stages in proportion; None: 300,000 on the circle, a million in the pipe
 
     Raises:
         JobError: a training failed.
@@ -108,7 +108,7 @@ def measure(
         for name, own in runs.items()
         for seed in own
     ]
-    run_stages(out, PrintedSettings(pipe_env_steps), [demonstrated, trained])
+    run_stages(out, PrintedSettings(env_steps), [demonstrated, trained])
     # Gather the figures, and draw the curves.
     opened = {name: [Run.open(out / run_name(name, seed)) for seed in own] for name, own in runs.items()}
     metrics = {name: [run.metrics() for run in own] for name, own in opened.items()}
@@ -171,9 +171,10 @@ def train(folder: Path, settings: PrintedSettings, name: str, seed: int) -> None
     options = ["--preset", PRESETS[case.task], "--seed", str(seed), "--out", str(run)]
     if diameter_mm := PIPES_MM.get(case.task):
         options += ["--pipe", str(diameter_mm)]
-        if settings.pipe_env_steps:
-            options += ["--learner.total-env-steps", str(settings.pipe_env_steps)]
-    command(log, "imitate", str(folder / demos_file(case.task)), *options, *(f"--{x}" for x in case.settings))
+    if settings.env_steps:
+        options += ["--learner.total-env-steps", str(settings.env_steps)]
+    changes = [f"--{text.removesuffix('=true')}" for text in case.settings]  # a flag has no value
+    command(log, "imitate", str(folder / demos_file(case.task)), *options, *changes)
 
 
 def circle_errors(runs: Sequence[Run]) -> dict[Path, dict[str, float]]:

@@ -9,7 +9,8 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from tests.train.small import CONFIG, LEARNER, SHORT
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
-from train.agent.imitation import GoalStage, ImitationConfig
+from train.agent.imitation import ImitationConfig
+from train.agent.stages import GoalStage
 from train.config import TrainConfig
 from train.demos.demonstrations import Demonstrations
 

@@ -27,7 +27,6 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 from jax import Array
-from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -35,46 +34,11 @@ from mjx_softarm.mdp import observation, rewards
 from train.agent.gail import DiscriminatorState, Gail, GailConfig
 from train.agent.learner import Experience, Explored, Learner, Sample, Transition, check_settings
 from train.agent.networks import check_same_shapes
+from train.agent.stages import STAGES_OPTION, GoalStage
 from train.agent.tqc import HindsightTQC, TQCConfig
 from train.demos.demonstrations import Demonstrations, shown_before
 
 ExpertStart = Literal["agent", "shown"]
-
-
-@dataclass(frozen=True)
-class GoalStage:
-    """A part of the schedule of demonstrated goals."""
-
-    share: float = 1.0  # share of the run's environment steps
-    every: int = 1  # every n-th demonstrated pose is a goal; 1 is all of them
-    kept: float = 1.0  # share of the replay's transitions that is kept as the stage begins
-
-    def __post_init__(self) -> None:
-        required = {
-            "share": (0.0 < self.share <= 1.0, "more than 0 and at most 1"),
-            "every": (self.every >= 1, "at least 1"),
-            "kept": (0.0 <= self.kept <= 1.0, "0 to 1"),
-        }
-        check_settings("learner.stages", self, required)
-
-
-def _stages(words: list[str]) -> tuple[GoalStage, ...]:
-    stages = []
-    for word in words:
-        numbers = word.split(",")
-        if len(numbers) != 3:
-            raise ValueError(f"got {word!r}, expected SHARE,EVERY,KEPT")
-        stages.append(GoalStage(float(numbers[0]), int(numbers[1]), float(numbers[2])))
-    return tuple(stages)
-
-
-_STAGES_OPTION = PrimitiveConstructorSpec(
-    nargs="*",
-    metavar="SHARE,EVERY,KEPT",
-    instance_from_str=_stages,
-    is_instance=lambda value: isinstance(value, tuple),
-    str_from_instance=lambda stages: [f"{stage.share:.3g},{stage.every},{stage.kept:g}" for stage in stages],
-)
 
 
 @dataclass(frozen=True)
@@ -94,7 +58,7 @@ class ImitationConfig(TQCConfig):
     expert_start: ExpertStart = "agent"
     """state at which the discriminator sees the expert's action: the agent's; or, as in the paper, the pose
     shown before"""
-    stages: Annotated[tuple[GoalStage, ...], _STAGES_OPTION] = (GoalStage(),)
+    stages: Annotated[tuple[GoalStage, ...], STAGES_OPTION] = (GoalStage(),)
     """stages in order: share of the env steps (all add up to 1), every n-th pose is a goal, share of the
     replay that is kept as the stage begins"""
     rebalance_env_steps: int = 0

@@ -61,7 +61,7 @@ def test_demonstrations_are_the_expert_s_postures(tmp_path, monkeypatch):
 def test_a_training_resumes_what_there_is(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(printed, "command", lambda log, *words: calls.append(words))
-    settings = printed.PrintedSettings(pipe_env_steps=600_000)
+    settings = printed.PrintedSettings(env_steps=600_000)
     printed.train(tmp_path, settings, "pipe, hand-made", 1)
     run = tmp_path / "pipe-hand-made-seed1"
     run.mkdir()
