@@ -20,6 +20,7 @@ BENCHMARKS = {
     "gpu": "benchmarks.speed.gpu:measure",
     "settle": "benchmarks.speed.settle:measure",
     "start": "benchmarks.speed.start:measure",
+    "growth": "benchmarks.speed.growth:measure",
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",
     "changes": "benchmarks.accuracy.changes:measure",

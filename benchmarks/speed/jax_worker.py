@@ -2,15 +2,17 @@
 
     python -m benchmarks.speed.jax_worker steps ENGINE MODE N_ARMS           environment steps
     python -m benchmarks.speed.jax_worker settle ENGINE REFERENCES LINKS     settling alone
-    python -m benchmarks.speed.jax_worker learn PRESET N_ARMS BATCH_SIZE     epochs of a learner
+    python -m benchmarks.speed.jax_worker learn PRESET N_ARMS BATCH_SIZE [N_DEVICES]    epochs of a learner
 
 REFERENCES is an npy file with references (n, n_springs) [m], LINKS a number of links per section. The first
-two tell where the arms settled. BATCH_SIZE is 0 for a learner without a replay.
+two tell where the arms settled. BATCH_SIZE is 0 for a learner without a replay; N_DEVICES is 1 if it is left
+out, and a CPU makes as many of itself.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import resource
 import sys
 import time
 from collections.abc import Callable
@@ -28,7 +30,7 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.gym import EPISODE_LENGTH
 from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.spec import ArmSpec
-from train.epoch.devices import split
+from train.epoch.devices import mesh_of, split
 from train.presets import PRESETS
 from train.runs.run import timed_epoch
 from train.runs.task import task_of
@@ -118,8 +120,11 @@ def settle(engine: str, references: str, links: str) -> tuple[Facts, Callable[[]
     return {}, work
 
 
-def learn(preset: str, n_arms: str, batch_size: str) -> tuple[Facts, Callable[[], Facts]]:
+def learn(
+    preset: str, n_arms: str, batch_size: str, n_devices: str = "1"
+) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare epochs of a preset with other numbers of arms and of transitions in a batch."""
+    jax.config.update("jax_num_cpu_devices", int(n_devices))
     config, n, batch = PRESETS[preset], int(n_arms), int(batch_size)
     # A short epoch. A learner from the replay warms up in the first action of all arms.
     sizes: dict[str, Any] = {"n_arms": n, "vector_steps_per_epoch": N_VECTOR_STEPS}
@@ -127,7 +132,8 @@ def learn(preset: str, n_arms: str, batch_size: str) -> tuple[Facts, Callable[[]
         sizes |= {"batch_size": batch, "updates_per_env_step": N_UPDATES / n, "warmup_env_steps": n}
         sizes |= {"replay_capacity": N_VECTOR_STEPS * n}
     learner = dataclasses.replace(config.learner, **sizes)
-    job = task_of(dataclasses.replace(config, learner=learner), ReachEnv(config=config.env)).job
+    mesh = mesh_of(n_devices)
+    job = task_of(dataclasses.replace(config, learner=learner), ReachEnv(config=config.env), mesh=mesh).job
     start = time.perf_counter()
     state = job.start(lambda: job.init(jax.random.PRNGKey(0)))
     state, _ = jax.block_until_ready(job.epoch(state))
@@ -139,7 +145,8 @@ def learn(preset: str, n_arms: str, batch_size: str) -> tuple[Facts, Callable[[]
         while not rates or time.perf_counter() - begin < ROUND_S:
             state, metrics = timed_epoch(job, state, learner, 1)
             rates.append({name: metrics[f"speed/{name}_per_s"] for name in ("env_steps", "updates")})
-        return {f"{name}_per_s": float(np.median([rate[name] for rate in rates])) for name in rates[0]}
+        told = {f"{name}_per_s": float(np.median([rate[name] for rate in rates])) for name in rates[0]}
+        return told | {"peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)}
 
     return facts, work
 
