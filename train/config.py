@@ -49,7 +49,8 @@ class TrainConfig:
 
     def with_policy_of(self, donor: TrainConfig) -> Self:
         """Return these settings for a run that begins with another's policy, with its hidden layers."""
-        learner = dataclasses.replace(self.learner, hidden=donor.learner.hidden)
+        of_policy = {name: getattr(donor.learner, name) for name in ("hidden", "activation")}
+        learner = dataclasses.replace(self.learner, **of_policy)
         if type(learner) is TQCConfig and self.env.moves:
             learner = dataclasses.replace(learner, from_policy=True)
         return dataclasses.replace(self, learner=learner)
@@ -95,9 +96,13 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 def from_dict(data: dict[str, Any]) -> TrainConfig:
     """Return the config that `to_dict` gave; a setting that is missing has its default.
 
+    The policies of runs that have no `activation` are ReLU networks.
+
     Raises:
         ConfigError: a setting is unknown or of the wrong type.
     """
+    if isinstance(learner := data.get("learner"), dict):
+        data = {**data, "learner": {"activation": "relu", **learner}}
     return _read(TrainConfig, data, "config")
 
 

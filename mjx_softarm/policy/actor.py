@@ -35,8 +35,8 @@ def policy_from_actor(
         reward: the environment's.
         model: networks and workspace of the arm.
         provenance: how the policy came about, in types that JSON has.
-        settings: fields of `Policy` that have defaults, from the environment and the evaluation:
-            `observation`, `tolerance_m`, `n_actions`, `action_s`.
+        settings: fields of `Policy` that have defaults, from the run, its environment and its evaluation:
+            `activation`, `observation`, `tolerance_m`, `n_actions`, `action_s`.
 
     Raises:
         ValueError: the parameters are not those of an actor for this arm. It is a SealedFileError if an

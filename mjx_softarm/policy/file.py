@@ -9,7 +9,8 @@ float64, networks and the workspace float32.
     obs_layout           (O,) text    names of the observation's entries, `layouts` of that kind
     action_layout        (n,) text    names of the action's entries, `action_layout`
     actor.n_layers       () int
-    actor.<k>.weight     (in, out)    layer k = 0, 1, ...; ReLU after each but the last
+    actor.activation     ()           "relu" or "swish", after each layer but the last
+    actor.<k>.weight     (in, out)    layer k = 0, 1, ...
     actor.<k>.bias       (out,)       the last layer's outputs (n,) are the actions before tanh
     obs_scale.<field>    (6,)         `ObsScale`: centre and scale of poses and goals
     reward.<field>       () or (6,)   `RewardConfig`: weights of the error, threshold of a goal
@@ -46,7 +47,7 @@ import numpy as np
 
 from mjx_softarm._support import archive
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of
-from mjx_softarm._support.mlp import Layer
+from mjx_softarm._support.mlp import ACTIVATIONS, Activation, Layer
 from mjx_softarm.control import TOLERANCE_M, Gains, allocation
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import Observation, ObsScale, layouts
@@ -59,7 +60,7 @@ from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 from mjx_softarm.spec_tables import Mounting
 
-SCHEMA_VERSION = 10
+SCHEMA_VERSION = 11
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
@@ -83,6 +84,7 @@ class Policy:
     s2r: S2R | None
     spec: ArmSpec
     provenance: Mapping[str, Any]
+    activation: Activation = "relu"
     observation: Observation = "pose"
     tolerance_m: float = TOLERANCE_M
     n_actions: int = N_ACTIONS
@@ -149,6 +151,7 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     entries: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "spec_json": json.dumps(policy.spec.to_dict()),
+        "actor.activation": policy.activation,
         "observation": policy.observation,
         "obs_layout": policy.obs_layout,
         "action_layout": action_layout(policy.spec),
@@ -217,6 +220,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
         spec=spec,
         provenance=entries.table("provenance_json"),
+        activation=entries.take("actor.activation", np.str_, ()),
         observation=observation,
         tolerance_m=entries.take("tolerance_m", np.float64, ()),
         n_actions=entries.take("n_actions", np.integer, ()),
@@ -236,6 +240,7 @@ def _check_numbers(policy: Policy, arrays: Mapping[str, np.ndarray], entries: En
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     actions = action_layout(policy.spec)
     for name, holds, expected in (
+        ("actor.activation", policy.activation in ACTIVATIONS, " or ".join(ACTIVATIONS)),
         ("observation", bool(layout), " or ".join(layouts(policy.spec))),
         ("obs_layout", np.array_equal(arrays["obs_layout"], layout), list(layout)),
         ("action_layout", arrays["action_layout"] == np.array(actions), list(actions)),

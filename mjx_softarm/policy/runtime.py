@@ -83,7 +83,7 @@ def sensed(
 
 def actor_output(policy: Policy, observation: Array) -> Array:
     """Return the action (..., n) in [-1, 1] of observations (..., O)."""
-    return array_namespace(observation).tanh(mlp(policy.layers, observation))
+    return array_namespace(observation).tanh(mlp(policy.layers, observation, policy.activation))
 
 
 def action_towards(policy: Policy, pose: Array, goal: Array, sensed: Array | None = None) -> Array:

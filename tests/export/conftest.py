@@ -67,7 +67,8 @@ def moving_policy(spec=SPEC):
 def carrying_policy(spec=SPEC):
     """A busy policy that observes the payload."""
     actor = layers(len(layouts(spec)["payload"]), 12, spec.n_springs, scale=0.5)
-    return dataclasses.replace(busy_policy(spec), layers=actor, observation="payload")
+    changes = {"layers": actor, "activation": "swish", "observation": "payload"}
+    return dataclasses.replace(busy_policy(spec), **changes)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
+from mjx_softarm._support.mlp import ACTIVATIONS
 from mjx_softarm.deploy import PolicyRunner, load_policy
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
@@ -49,10 +50,11 @@ def actor_params():
     return tree.unflatten(map(jnp.add, leaves, changes))
 
 
-@pytest.fixture(scope="module")
-def file(spec, actor_params, make_arm_model, tmp_path_factory):
-    path = tmp_path_factory.mktemp("export") / "policy.npz"
-    save_policy(path, policy_from_actor(actor_params, spec, RewardConfig(), make_arm_model(spec), {}))
+@pytest.fixture(scope="module", params=ACTIVATIONS)
+def file(spec, actor_params, make_arm_model, tmp_path_factory, request):
+    path, model = tmp_path_factory.mktemp("export") / "policy.npz", make_arm_model(spec)
+    policy = policy_from_actor(actor_params, spec, RewardConfig(), model, {}, activation=request.param)
+    save_policy(path, policy)
     return path
 
 
@@ -79,7 +81,11 @@ def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, 
     nowhere = Pool(*[np.zeros((1, 6))] * 4)  # the arm does not move here
     monkeypatch.setattr("mjx_softarm.env.poses.sample_workspace", lambda *_: nowhere)
     env = ReachEnv(spec)
-    action = mode(Actor(9).apply(actor_params, env.observe(*map(jnp.asarray, poses)))[0])
+    action = mode(
+        Actor(9, activation=runner.policy.activation).apply(
+            actor_params, env.observe(*map(jnp.asarray, poses))
+        )[0]
+    )
     reference = runner.act(*poses)
     assert np.min(action) < -0.9 and np.max(action) > 0.9 and np.ptp(action, axis=0).min() > 0.5
     np.testing.assert_allclose(runner.action(*poses), action, rtol=0, atol=1e-5)

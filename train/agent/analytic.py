@@ -33,6 +33,7 @@ from jax.sharding import Mesh
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
+from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv, over_arms
@@ -52,6 +53,7 @@ class AnalyticConfig(LearnerConfig):
     VARIABLE += ("saturation_cost_per_mm",)
 
     hidden: tuple[int, ...] = (256, 256, 256, 256)  # widths of the policy's hidden layers
+    activation: Activation = "swish"  # function after each of them
     n_arms: int = 64  # arms of a gradient step
     total_env_steps: int = 64 * 98_304  # actions of all arms together; each arm takes one per gradient step
     vector_steps_per_epoch: int = 256  # gradient steps between two reports
@@ -116,7 +118,7 @@ class Analytic(Learner):
 
     def __init__(self, config: AnalyticConfig, env: ReachEnv, mesh: Mesh | None = None):
         self.config, self.env, self.mesh = config, env, mesh
-        self.actor: Any = Actor(env.action_size, config.hidden)
+        self.actor: Any = Actor(env.action_size, config.hidden, config.activation)
         self.arms = VectorEnv(env, config.n_arms, episode_length=1, mesh=mesh)
         self.optimizer = optax.chain(
             optax.clip_by_global_norm(config.max_gradient_norm),

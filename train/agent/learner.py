@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 from jax import Array
 
+from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.actions import N_ACTIONS
 
@@ -40,6 +41,7 @@ class LearnerConfig:
     VARIABLE: ClassVar[tuple[str, ...]] = ()  # names of plain numbers that members of a sweep may differ in
 
     hidden: tuple[int, ...] = (256, 256)  # widths of the policy's hidden layers
+    activation: Activation = "relu"  # function after each of them
     n_arms: int = 128  # arms simulated side by side
     total_env_steps: int = 300_000  # actions of all arms together
     vector_steps_per_epoch: int = 16  # actions of each arm between two reports

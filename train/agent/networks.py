@@ -6,6 +6,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mjx_softarm._support.mlp import Activation, activate
 from mjx_softarm.mdp.observation import OBS_SIZE
 
 LOG_STD_MIN = -20.0
@@ -15,7 +16,7 @@ COST_AHEAD = 40.0  # initial weight of a predicted error of 1, summed over the p
 
 
 class Actor(nn.Module):
-    """ReLU network from an observation to a diagonal Gaussian over pre-squash actions.
+    """Network from an observation to a diagonal Gaussian over pre-squash actions.
 
     Layers are named `hidden_0`, `hidden_1`, ... and `head`, by which export finds them. The head's first
     `action_size` outputs are the mean, the others the log standard deviation.
@@ -23,17 +24,19 @@ class Actor(nn.Module):
     Attributes:
         action_size: number of actions A.
         hidden: width of each hidden layer.
+        activation: function after each hidden layer.
     """
 
     action_size: int
     hidden: tuple[int, ...] = (256, 256)
+    activation: Activation = "relu"
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return mean (..., A) and log standard deviation (..., A), clipped to [-20, 2], at obs (..., O)."""
         x = obs  # (..., O)
         for i, width in enumerate(self.hidden):
-            x = nn.relu(nn.Dense(width, name=f"hidden_{i}")(x))  # (..., H_i)
+            x = activate(nn.Dense(width, name=f"hidden_{i}")(x), self.activation)  # (..., H_i)
         head = nn.Dense(2 * self.action_size, name="head")(x)  # (..., 2A)
         mean, log_std = jnp.split(head, 2, axis=-1)  # (..., A) each
         return mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)

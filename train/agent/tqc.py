@@ -110,7 +110,7 @@ class TQC:
 
     def __init__(self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig()) -> None:
         self.obs_size, self.action_size, self.config = obs_size, action_size, config
-        self.actor: Any = Actor(action_size, config.hidden)
+        self.actor: Any = Actor(action_size, config.hidden, config.activation)
         self.critics: Any = Critics(
             config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
         )

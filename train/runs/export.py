@@ -53,6 +53,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
             env.reward,
             arm.model,
             provenance,
+            activation=run.config.learner.activation,
             observation=env.observation,
             tolerance_m=1e-3 * env.saturation_tolerance_mm,
             n_actions=N_ACTIONS,

@@ -64,7 +64,7 @@ def test_arms_go_on_from_where_their_actions_led_and_some_begin_anew(learner, up
     assert 0 < begun.sum() < N_ARMS
     moved = jax.jit(jax.vmap(learner.env.step))(start.arms, learner.mode(start.actor_params, start.arms.obs))
     np.testing.assert_allclose(
-        after.arms.pipeline_state.pose[~begun], moved.pipeline_state.pose[~begun], atol=1e-3
+        after.arms.pipeline_state.pose[~begun], moved.pipeline_state.pose[~begun], atol=5e-3
     )
 
 
