@@ -15,8 +15,9 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.networks import ArmModel
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
 from mjx_softarm.sensing.load import LoadEstimator
-from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
 from tests.arms import FOUR_CHAMBERS, OTHER_ARMS, SIX_CHAMBERS, TAPERED
+from tests.networks import s2r_of
 
 jax.config.update("jax_num_cpu_devices", 8)  # most tests use one of them
 N_ARMS = 512  # in each call of `reset` and `step`: another number would compile anew
@@ -131,12 +132,8 @@ def make_arm_model():
         springs = SpringModel(layers(spec.n_chambers, 5, n), *kpa, *scaling)
         poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
         n_in = N_POSE_INPUTS + n
-        s2r_network = S2R(
-            layers(n_in, 6, N_POSE_OUTPUTS),
-            *(row(-1.0, n_in), row(1.0, n_in), row(-5.0, N_POSE_OUTPUTS), row(5.0, N_POSE_OUTPUTS)),
-            np.float32(rng.normal(size=(4, n_in))),
-            np.float32(0.3),
-        )
+        network, anchors = layers(n_in, 6, N_POSE_OUTPUTS), np.float32(rng.normal(size=(4, n_in)))
+        s2r_network = s2r_of(network, 5.0, anchors=anchors, limit=np.float32(0.3))
         return ArmModel(poses, estimator, load, springs, s2r_network if s2r else None)
 
     return make

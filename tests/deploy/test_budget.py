@@ -16,7 +16,7 @@ from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.pose import quaternion_from_pose
-from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
 from tests.linear_arm import (
     CONTROLLER,
     GAIN_M_PER_KPA,
@@ -28,20 +28,12 @@ from tests.linear_arm import (
     N,
     go,
 )
+from tests.networks import s2r_of
 
 KG = 1.0
 SHIFT_M = 1e-3 * np.array([0.0, 1.0, 0.0, -1.0, 0.0, 1.0, 0.0, 0.0, -1.0])
-_edge, _out = np.ones(N_POSE_INPUTS + N, np.float32), np.ones(N_POSE_OUTPUTS, np.float32)
-NO_CHANGE = S2R(
-    layers=((np.zeros((len(_edge), len(_out)), np.float32), 0 * _out),),
-    input_low=-_edge,
-    input_high=_edge,
-    output_low=-_out,
-    output_high=_out,
-    anchors=_edge[None],
-    limit=np.float32(1e3),
-    error_mm=np.float32(0.4),
-)
+_nothing = np.zeros((N_POSE_INPUTS + N, N_POSE_OUTPUTS), np.float32), np.zeros(N_POSE_OUTPUTS, np.float32)
+NO_CHANGE = s2r_of((_nothing,), 1.0, limit=np.float32(1e3), error_mm=np.float32(0.4))
 load = POLICY.estimator.load_layers[0]
 MOVED = POLICY.estimator._replace(load_layers=((load[0], load[1] + np.float32([0.003, 0, 0] * 6)),))
 ERRORS = {"tip_mm": {"0 kg": {"median": 0.3}, "1 kg": {"median": 9.0}}}

@@ -12,7 +12,7 @@ from mjx_softarm.deploy.safety import Fault, Response
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.sensing.estimator import estimate
-from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R, correct, extrapolation
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, correct, extrapolation
 from tests.linear_arm import (
     CONTROLLER,
     DT_S,
@@ -32,6 +32,7 @@ from tests.linear_arm import (
     nan,
     read_m,
 )
+from tests.networks import s2r_of
 
 
 def late(readings):
@@ -185,18 +186,12 @@ def test_the_table_of_faults_names_each_response():
 
 def test_s2r_corrects_the_estimate_and_extrapolation_is_counted():
     rng, edge = np.random.default_rng(3), np.ones(N_POSE_INPUTS + N, np.float32)
-    network = S2R(
-        layers=tuple(
-            (rng.normal(0.0, 0.2, shape).astype(np.float32), np.zeros(shape[1], np.float32))
-            for shape in ((len(edge), 16), (16, N_POSE_OUTPUTS))
-        ),
-        input_low=-edge,
-        input_high=edge,
-        output_low=np.float32([-9.0] * 3 + [-0.1] * 3),
-        output_high=np.float32([9.0] * 3 + [0.1] * 3),
-        anchors=edge[None],
-        limit=np.float32(0.002),
+    layers = tuple(
+        (rng.normal(0.0, 0.2, shape).astype(np.float32), np.zeros(shape[1], np.float32))
+        for shape in ((len(edge), 16), (16, N_POSE_OUTPUTS))
     )
+    bound = np.repeat([9.0, 0.1], 3)
+    network = s2r_of(layers, bound, anchors=edge[None], limit=np.float32(0.002))
     controller = Controller.of(dataclasses.replace(POLICY, s2r=network), exact_plan)
     run = go(LinearArm(), goals=GOALS[:1], controller=controller)
     assert run.counts() == {Fault.EXTRAPOLATION: N_ACTIONS}

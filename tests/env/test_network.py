@@ -13,7 +13,7 @@ from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import frame_from_pose
-from mjx_softarm.sensing.s2r import S2R
+from tests.networks import s2r_of
 
 MM = 1e-3
 SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
@@ -27,14 +27,11 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
     weight[9, 0] = 30.0  # mm for half the range of the first spring
     bound = np.array([40.0] * 3 + [0.2] * 3, np.float32)
     low, high = (np.r_[np.full(3, x), [-1.0 if x < 0 else 1.0] * 6] for x in (-0.5, 0.5))
-    network = S2R(
-        layers=((weight, np.array([0.0, -4.0, 0.0, 0.0, 0.0, 0.1], np.float32)),),
+    network = s2r_of(
+        ((weight, np.array([0.0, -4.0, 0.0, 0.0, 0.0, 0.1], np.float32)),),
+        bound,
         input_low=np.float32(np.r_[low, np.full(n_springs, 0.05)]),
         input_high=np.float32(np.r_[high, np.full(n_springs, 0.35)]),
-        output_low=-bound,
-        output_high=bound,
-        anchors=np.zeros((1, 9 + n_springs), np.float32),
-        limit=np.float32(1.0),
     )
     plain, real = ReachEnv(SHORT_ARM, config), ReachEnv(SHORT_ARM, config, network)
     with pytest.raises(ValueError, match="got 3, expected 2, as the sim-to-real network has"):

@@ -13,8 +13,9 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import golden_cases
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.policy.file import load_policy, save_policy
-from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
 from tests.linear_arm import SPEC, N, gain_of, make_policy
+from tests.networks import s2r_of
 
 
 def layers(*sizes, scale):
@@ -29,13 +30,9 @@ def busy_policy(spec=SPEC):
     """The linear arm's policy with an actor, an estimator and a sim-to-real network that change much."""
     policy, n, n_sections = make_policy(spec), spec.n_springs, spec.structure.n_sections
     n_in = N_POSE_INPUTS + n
-    s2r = S2R(
-        layers(n_in, 8, N_POSE_OUTPUTS, scale=0.3),
-        *(np.full(n_in, value, np.float32) for value in (-1.0, 1.0)),
-        *(np.float32(sign * np.array([9.0] * 3 + [0.1] * 3)) for sign in (-1, 1)),
-        anchors=np.float32(np.random.default_rng(6).normal(0.0, 0.1, (5, n_in))),
-        limit=np.float32(0.335),
-    )
+    anchors = np.float32(np.random.default_rng(6).normal(0.0, 0.1, (5, n_in)))
+    network, bound = layers(n_in, 8, N_POSE_OUTPUTS, scale=0.3), np.repeat([9.0, 0.1], 3)
+    s2r = s2r_of(network, bound, anchors=anchors, limit=np.float32(0.335))
     estimator = policy.estimator._replace(
         layers=layers(n + 3 * n_sections, 6, 6 * n_sections, scale=0.2),
         load_layers=layers(n + 3 * n_sections + 1, 6, 6 * n_sections, scale=0.2),

@@ -1,10 +1,35 @@
 """A server of pages, and a headless browser; tests that need one are skipped where there is none."""
 
 import shutil
+import time
+from multiprocessing import Pipe
 
 import pytest
 
+from mjx_softarm.view.channel import ChannelEnd
+
 FLAGS = ("--no-sandbox", "--use-gl=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+
+
+def wait_for(condition, seconds=10.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def taken(end, name):
+    """All values that come over a channel until one of this name does."""
+    found = {}
+    wait_for(lambda: found.update(end.take()) or name in found)
+    return found
+
+
+@pytest.fixture
+def ends():
+    """One end of a channel, and the connection of the other."""
+    ours, theirs = Pipe()
+    return ChannelEnd(ours), theirs
 
 
 @pytest.fixture

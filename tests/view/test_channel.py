@@ -1,32 +1,10 @@
 """A channel of which neither end waits for the other."""
 
 import time
-from multiprocessing import Pipe
 
 import numpy as np
-import pytest
 
-from mjx_softarm.view.channel import ChannelEnd
-
-
-def wait_for(condition, seconds=10.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
-def taken(end, name):
-    """All values that come until one of this name does."""
-    found = {}
-    wait_for(lambda: found.update(end.take()) or name in found)
-    return found
-
-
-@pytest.fixture
-def ends():
-    ours, theirs = Pipe()
-    return ChannelEnd(ours), theirs
+from tests.view.conftest import taken, wait_for
 
 
 def test_channel_keeps_the_newest_of_each_name(ends):

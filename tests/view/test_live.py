@@ -2,7 +2,6 @@
 
 import threading
 import time
-from multiprocessing import Pipe
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,15 +11,8 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.goals import Orders
 from mjx_softarm.deploy.loop import Tick, start, with_goal
 from mjx_softarm.deploy.session import steer
-from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.live import PagePilot, place_poses
 from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm
-
-
-@pytest.fixture
-def ends():
-    ours, theirs = Pipe()
-    return ChannelEnd(ours), theirs
 
 
 class Inbox:

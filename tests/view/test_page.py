@@ -10,6 +10,7 @@ import pytest
 from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.look import look_at
 from tests.linear_arm import GOALS, POLICY, REST_M, SPEC, N
+from tests.view.conftest import taken
 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
 import msgspec
@@ -50,15 +51,6 @@ def page(server):
     return Page(server, ChannelEnd(theirs), Setup(POLICY, "arm", "127.0.0.1", 8420, True)), ChannelEnd(ours)
 
 
-def until(end, name, seconds=10.0):
-    found, deadline = {}, time.monotonic() + seconds
-    while name not in found:
-        assert time.monotonic() < deadline
-        found |= end.take()
-        time.sleep(0.002)
-    return found
-
-
 def button(server, label):
     handles = server.gui._gui_input_handle_from_uuid.values()
     return next(handle for handle in handles if getattr(handle, "label", "") == label)._impl.uuid
@@ -74,26 +66,26 @@ def test_vent_passes_through_a_flood_of_drags(server, page):
 
     thread = threading.Thread(target=flood)
     thread.start()
-    until(loop, "goal")
+    taken(loop, "goal")
     began = time.monotonic()
     other.send(_messages.GuiUpdateMessage(button(server, "Vent"), {"value": True}))
-    found = until(loop, "vent")
+    found = taken(loop, "vent")
     over.set()
     thread.join()
     assert time.monotonic() - began < 2.0 and found["vent"] is True
     flooder.drag(0.2)
     wanted = [200.0, 0.0, -500.0, 0.0, 0.0, 0.0]
     deadline = time.monotonic() + 10.0
-    while not np.allclose(until(loop, "goal")["goal"], wanted):  # one for all that were not taken
+    while not np.allclose(taken(loop, "goal")["goal"], wanted):  # one for all that were not taken
         assert time.monotonic() < deadline
     flooder.socket.close()
-    assert until(loop, "pages")["pages"] == 1
+    assert taken(loop, "pages")["pages"] == 1
 
 
 def test_client_that_reads_nothing_holds_up_no_frame(server, page):
     shown, loop = page
     stalled = Client(server)
-    until(loop, "pages")
+    taken(loop, "pages")
     row = {"time_s": 0.0, "goal": GOALS[0], "estimate": GOALS[0]}
     spent_s = []
     for k in range(100):

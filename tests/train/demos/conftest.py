@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm.mechanics.pipe import CrossPipe
-from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
+from tests.networks import s2r_of
 from train.demos.expert import Expert
 from train.demos.waypoints import SQUARE, Waypoint, task
 
@@ -22,15 +23,7 @@ def shifting_s2r(spec):
     """A sim-to-real network that moves every tip alike."""
     n_in = N_POSE_INPUTS + spec.n_chambers
     output = np.float32([*SHIFT_MM, 0.0, 0.0, 0.0])
-    return S2R(
-        layers=((np.zeros((n_in, N_POSE_OUTPUTS), np.float32), output),),
-        input_low=np.full(n_in, -1.0, np.float32),
-        input_high=np.full(n_in, 1.0, np.float32),
-        output_low=np.full(N_POSE_OUTPUTS, -10.0, np.float32),
-        output_high=np.full(N_POSE_OUTPUTS, 10.0, np.float32),
-        anchors=np.zeros((1, n_in), np.float32),
-        limit=np.float32(1.0),
-    )
+    return s2r_of(((np.zeros((n_in, N_POSE_OUTPUTS), np.float32), output),), 10.0)
 
 
 @pytest.fixture(scope="session")
