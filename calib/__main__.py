@@ -22,7 +22,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.checks import Finding
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.spec import ARM_FILE, ArmSpec
+from mjx_softarm.spec import ArmSpec
 
 Logs = Annotated[
     tyro.conf.Positional[tuple[Path, ...]],
@@ -146,10 +146,10 @@ def _plan(
         out: table of pressures to write, CSV
         seed: seed of the candidates
     """
+    from calib.arm import CalibratedArm
     from calib.plan import RECORDED_FILE, load_recorded, plan
     from mjx_softarm._support import xla
     from mjx_softarm.logs.pressure_plan import write_plan
-    from mjx_softarm.sensing.held_pressures import find_pressures
 
     # Refuse what cannot be planned.
     _check_seed(seed)
@@ -157,12 +157,11 @@ def _plan(
         raise InputError(f"--poses: got {poses}, expected at least 1")
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
-    arm = ArmSpec.from_toml(calibration / ARM_FILE)
-    recorded = load_recorded(calibration / RECORDED_FILE, arm.n_chambers)
-    held = find_pressures(calibration, arm.structure.n_sections, arm.n_springs, arm.n_chambers)
+    arm = CalibratedArm.read(calibration)
+    recorded = load_recorded(calibration / RECORDED_FILE, arm.spec.n_chambers)
     # Choose the poses, and tell what they are for.
     xla.enable_compilation_cache()
-    found = plan(arm, recorded, poses, seed, held)
+    found = plan(arm.spec, recorded, poses, seed, arm.held)
     write_plan(out, found.pressure_kpa)
     now, then = found.n_unknown
     n_others = poses - found.n_informative - found.n_payload

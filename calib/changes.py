@@ -14,10 +14,10 @@ pressures without motion capture, are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
+from calib.arm import CalibratedArm
 from calib.fit.blocks import held_out_blocks
 from calib.fit.held_pressures import without_redundant_part
 from calib.fit.leastsquares import QUANTILE, Problem, Solution, fit
@@ -25,9 +25,9 @@ from calib.fit.pose_errors import PoseErrors, change_errors
 from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.control import chambers_of_springs
-from mjx_softarm.sensing.held_pressures import HeldPressures, held_kpa
+from mjx_softarm.sensing.held_pressures import held_kpa
 from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, correct, correction_between
+from mjx_softarm.sensing.s2r import correct, correction_between
 from mjx_softarm.spec import ArmSpec
 
 MIN_POSES = 8
@@ -64,27 +64,22 @@ class Changes:
         return self.after_kpa < self.before_kpa
 
 
-def fit_changes(
-    spec: ArmSpec, s2r: S2R | None, poses: StaticPoses, seed: int = 0, held: HeldPressures | None = None
-) -> Changes:
+def fit_changes(arm: CalibratedArm, poses: StaticPoses, seed: int = 0) -> Changes:
     """Fit what has changed since a calibration.
 
     Args:
-        spec: the calibrated arm.
-        s2r: its sim-to-real network, if there is one.
+        arm: the calibrated arm.
         poses: later poses of the unloaded arm, `MIN_POSES` or more, with spring lengths by the old zeros and
             pressures; tips are NaN without motion capture.
         seed: chooses the held-out poses.
-        held: residual pressures of the calibration, if there are some.
     """
     # A fit without the held-out poses, which judge it, then to all poses
     held_out = held_out_blocks(poses.n, block=HELD_OUT_BLOCK, seed=seed)
-    arm = _Calibrated(spec, s2r, held)
     judged, found = (_fit(arm, poses.take(rows)) for rows in (~held_out, held_out | True))
     before, after = (_model(arm, poses.take(held_out), x)[0] for x in (0.0 * judged.x, judged.x))
 
     # The arm as it is now
-    n, n_chambers = spec.n_springs, spec.n_chambers
+    spec, n, n_chambers = arm.spec, arm.spec.n_springs, arm.spec.n_chambers
     zero_m, (stiffness, offset_kpa) = found.x[:n], found.x[n:].reshape(2, -1) @ _all_and_each(n_chambers).T
     old = np.array(spec.per_chamber(spec.chambers.stiffness_n_per_m))
     mean = np.repeat([0.0, 1.0, 1.0 / n_chambers, 0.0], [n, 1, n_chambers, 1 + n_chambers])
@@ -110,15 +105,7 @@ def fit_changes(
     )
 
 
-class _Calibrated(NamedTuple):
-    """Arm as it was calibrated; see `fit_changes`."""
-
-    spec: ArmSpec
-    s2r: S2R | None
-    held: HeldPressures | None
-
-
-def _fit(arm: _Calibrated, poses: StaticPoses) -> Solution:
+def _fit(arm: CalibratedArm, poses: StaticPoses) -> Solution:
     """Fit x: shifts of the zeros [m], stiffness of all and of each chamber, offsets [kPa] likewise."""
     spec, s2r, n_chambers = arm.spec, arm.s2r, arm.spec.n_chambers
     tip_mm = max(MIN_TIP_MM, 0.0 if s2r is None else float(s2r.error_mm))
@@ -129,7 +116,7 @@ def _fit(arm: _Calibrated, poses: StaticPoses) -> Solution:
     return fit(lambda x: _model(arm, poses, x), Problem(prior, group, scale, scale))
 
 
-def _model(arm: _Calibrated, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _model(arm: CalibratedArm, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return errors (m, 6 + n_chambers) [mm, rad, kPa] at x (p,), and derivatives (m, 6 + n_chambers, p).
 
     Errors are simulated less measured tips, and measured less simulated pressures; NaN where not measured,

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from calib.arm import CalibratedArm
 from calib.plan import RECORDED_FILE, Recorded, load_recorded, save_recorded
 from calib.read.measurements import measure
 from calib.report.page import Section, to_html, to_json
@@ -27,13 +28,8 @@ from calib.steps import STEPS, Extras, Step, changes
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.sensing.held_pressures import (
-    PRESSURES_FILE,
-    HeldPressures,
-    find_pressures,
-    save_pressures,
-)
-from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r, save_s2r
+from mjx_softarm.sensing.held_pressures import HeldPressures
+from mjx_softarm.sensing.s2r import S2R
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 
@@ -47,6 +43,11 @@ class Calibration:
     held: HeldPressures | None  # None where they were not fitted, or are no better than the simulation
     recorded: Recorded | None  # None where the chambers were not fitted
     pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
+
+    @property
+    def arm(self) -> CalibratedArm:
+        """The arm as training takes it."""
+        return CalibratedArm(self.spec, self.s2r, self.held)
 
 
 def calibrate(
@@ -105,7 +106,7 @@ def go_on(
     """
     progress("changes ...")
     measurements = measure(later, since.spec, needed=("pressure_kpa",))
-    spec, section, _ = changes(measurements, since.spec, seed, since.s2r, since.held)
+    spec, section, _ = changes(measurements, since.arm, seed)
     return dataclasses.replace(since, spec=spec, sections=(*since.sections, section))
 
 
@@ -115,13 +116,12 @@ def load_calibration(folder: Path) -> Calibration:
     Raises:
         InputError: a file is missing, damaged, or of another arm.
     """
-    spec, s2r = ArmSpec.from_toml(folder / ARM_FILE), folder / S2R_FILE
-    recorded = folder / RECORDED_FILE
+    (spec, s2r, held), recorded = CalibratedArm.read(folder), folder / RECORDED_FILE
     return Calibration(
         spec,
         (),
-        load_s2r(s2r, spec.n_springs) if s2r.exists() else None,
-        find_pressures(folder, spec.structure.n_sections, spec.n_springs, spec.n_chambers),
+        s2r,
+        held,
         load_recorded(recorded, spec.n_chambers) if recorded.exists() else None,
         read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {},
     )
@@ -159,10 +159,7 @@ def write_calibration(
         # Write a folder beside it, then rename that.
         part.mkdir(parents=True)
         calibration.spec.to_toml(part / ARM_FILE)
-        if calibration.s2r is not None:
-            save_s2r(part / S2R_FILE, calibration.s2r)
-        if calibration.held is not None:
-            save_pressures(part / PRESSURES_FILE, calibration.held)
+        calibration.arm.write_models(part)
         if calibration.recorded is not None:
             save_recorded(part / RECORDED_FILE, calibration.recorded)
         if calibration.pairs:

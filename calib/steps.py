@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 
+from calib.arm import CalibratedArm
 from calib.changes import MIN_POSES as MIN_LATER
 from calib.changes import fit_changes
 from calib.fit.chambers import MIN_POSES, fit_chambers
@@ -177,34 +178,20 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     return StepResult(spec, section, extras)
 
 
-def changes(
-    measurements: Measurements,
-    spec: ArmSpec,
-    seed: int,
-    s2r: S2R | None = None,
-    held: HeldPressures | None = None,
-) -> StepResult:
-    """Fit what has changed since a calibration to later poses of the unloaded arm.
-
-    Args:
-        measurements: later poses.
-        spec: arm as calibrated.
-        seed: seed of all random draws.
-        s2r: sim-to-real network of the calibration, if there is one.
-        held: residual pressures of the calibration, if there are some.
-    """
+def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
+    """Fit what has changed since an arm's calibration to later poses of the unloaded arm."""
+    spec, s2r, _ = arm
     poses = measurements.poses.with_lengths(spec)
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
     poses = poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
-    extras = Extras() if s2r is None else Extras(s2r=s2r)
     if poses.n < MIN_LATER:
         what = "pressures and spring lengths, without a payload"
         needed = f"{NOT_FITTED} {_few(MIN_LATER, what, poses.n, measurements.row_uses)}"
         remedy = f"what has changed is not known: measure {MIN_LATER} goals or more"
-        return StepResult(spec, Section(CHANGES, needed, warnings=(remedy,)), extras)
-    found = fit_changes(spec, s2r, poses, seed, held)
+        return StepResult(spec, Section(CHANGES, needed, warnings=(remedy,)))
+    found = fit_changes(arm, poses, seed)
     section = changes_section(found, 0.0 if s2r is None else float(s2r.error_mm))
-    return StepResult(found.spec if found.is_better else spec, section, extras)
+    return StepResult(found.spec if found.is_better else spec, section)
 
 
 STEPS: Mapping[str, Step] = MappingProxyType(

@@ -11,10 +11,10 @@ from typing import Annotated, Any, Self
 import tyro
 from rich.console import Console
 
+from calib.arm import CalibratedArm
 from mjx_softarm._support import cli, xla
-from mjx_softarm.sensing.held_pressures import HeldPressures, find_pressures
-from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r
-from mjx_softarm.spec import ARM_FILE, ArmSpec
+from mjx_softarm.sensing.s2r import S2R_FILE
+from mjx_softarm.spec import ArmSpec
 from train.agent.registry import LEARNERS, name_of
 from train.config import ConfigError, TrainConfig
 from train.presets import PRESETS
@@ -28,24 +28,17 @@ class ArmOptions:
     calibration: cli.MaybePath = None
     """folder that `python -m calib run` made, in the place of --spec"""
 
-    def read_arm(self, console: Console) -> tuple[ArmSpec, S2R | None]:
-        """Return the arm, and the sim-to-real network of its calibration if there is one."""
+    def read_arm(self, console: Console) -> CalibratedArm:
+        """Return the arm, with the models of its calibration if it has one."""
         if self.calibration is None:
-            return ArmSpec.of(self.spec), None
+            return CalibratedArm(ArmSpec.of(self.spec))
         if self.spec:
             raise ConfigError(f"--spec {self.spec}: got --calibration {self.calibration} too, expected one")
-        spec, file = ArmSpec.from_toml(self.calibration / ARM_FILE), self.calibration / S2R_FILE
-        if file.exists():
-            return spec, load_s2r(file, spec.n_springs)
-        console.print(f"no {file}: training on simulated poses", highlight=False, soft_wrap=True)
-        return spec, None
-
-    def read_pressures(self, spec: ArmSpec) -> HeldPressures | None:
-        """Return the residual pressures of the arm's calibration, if there are some."""
-        if self.calibration is None:
-            return None
-        sizes = spec.structure.n_sections, spec.n_springs, spec.n_chambers
-        return find_pressures(self.calibration, *sizes)
+        arm = CalibratedArm.read(self.calibration)
+        if arm.s2r is None:
+            absent = self.calibration / S2R_FILE
+            console.print(f"no {absent}: training on simulated poses", highlight=False, soft_wrap=True)
+        return arm
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,8 @@ from mjx_softarm.env import ReachEnv
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.render import Renderer
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
-from train.runs.checkpoint import Run
 from train.runs.evaluate import nominal, towards
+from train.runs.folder import Run
 from train.runs.run import task_of_run
 
 ACTION_S, FRAME_S = 0.5, 0.1  # simulated time between two actions, and between two pictures
@@ -50,7 +50,7 @@ def film(runs: tuple[Path, ...], out: Path = Path("docs/results/motion.gif")) ->
 def _env(run: Run) -> ReachEnv:
     """Return a run's arm in motion, which is seen more often than it is told what to do."""
     config = dataclasses.replace(run.config.env, mode="dynamic", dynamic_step_s=FRAME_S)
-    return nominal(ReachEnv(run.spec, config, run.s2r))
+    return nominal(ReachEnv(run.spec, config, run.arm.s2r))
 
 
 def _frames(run: Run, goals: Array) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from benchmarks.harness.common import target
 from mjx_softarm._support.errors import InputError
 from train.config import to_dict
 from train.presets import PRESETS
-from train.runs.checkpoint import Run
+from train.runs.folder import Run
 from train.sweep.report import by_settings
 
 

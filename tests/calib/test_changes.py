@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from calib.arm import CalibratedArm
 from calib.changes import fit_changes
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
@@ -45,7 +46,7 @@ def poses_of(spec, shift_m=0.0, softer=1.0, n=24, payload_kg=0.0, seed=1):
 
 @pytest.fixture(scope="module")
 def aged(spec):
-    return fit_changes(spec, None, poses_of(spec, SHIFT_M, SOFTER))
+    return fit_changes(CalibratedArm(spec), poses_of(spec, SHIFT_M, SOFTER))
 
 
 def test_shifted_zeros_and_softer_chambers_are_found(aged, spec):
@@ -72,7 +73,7 @@ def test_the_report_says_what_has_changed(aged):
 def test_without_motion_capture_the_pressures_show_softer_chambers(spec):
     poses = poses_of(spec, 0.0, SOFTER)
     unseen = poses._replace(tip_m=np.nan * poses.tip_m, tip_rotation=np.nan * poses.tip_rotation)
-    found = fit_changes(spec, None, unseen)
+    found = fit_changes(CalibratedArm(spec), unseen)
     assert found.is_better and found.before.n == 0
     assert found.stiffness.mean() == pytest.approx(SOFTER - 1.0, abs=0.015)
     section = changes_section(found, known_mm=0.3)
@@ -86,12 +87,12 @@ def test_without_motion_capture_the_pressures_show_softer_chambers(spec):
 
 def test_an_arm_that_has_not_changed_keeps_its_calibration(spec):
     measurements = Measurements((), poses_of(spec), {})
-    result = changes(measurements, spec, 0)
+    result = changes(measurements, CalibratedArm(spec), 0)
     assert np.abs(result.spec.spring_sensor.delta_m - spec.spring_sensor.delta_m).max() < 1e-4
 
 
 def test_poses_with_a_payload_do_not_count(spec):
     loaded = Measurements((), poses_of(spec, payload_kg=0.5), {"used": 24})
-    result = changes(loaded, spec, 0)
+    result = changes(loaded, CalibratedArm(spec), 0)
     assert result.spec == spec and "measure 8 goals or more" in result.section.warnings[0]
     assert "Got 0 poses at rest" in result.section.text

@@ -145,12 +145,12 @@ def trained_env(tmp_path, monkeypatch):
 
 def test_training_takes_the_folder(calibrated, trained_env, tmp_path):
     """The run has the calibrated arm and its network, and so has what is opened from it."""
-    from train.runs.checkpoint import Run
+    from train.runs.folder import Run
 
     env, opened = trained_env(calibrated[1]), Run.open(tmp_path / "run")
     assert env.spec == opened.spec == ArmSpec.from_toml(calibrated[1] / "arm.toml")
     network = load_s2r(calibrated[1] / "s2r.npz", 9)
-    for s2r in (env.s2r, opened.s2r):
+    for s2r in (env.s2r, opened.arm.s2r):
         np.testing.assert_array_equal(s2r.anchors, network.anchors)
     plain = type(env)(env.spec, env.config)
     assert np.abs(env.pool.pose - plain.pool.pose)[:, :3].max() > 0.5

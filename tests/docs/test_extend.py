@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from calib.arm import CalibratedArm
 from tests.train.small import CONFIG, SHORT, flags
-from train.runs.checkpoint import Run
+from train.runs.folder import Run
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = dict(
@@ -82,7 +83,7 @@ def test_a_learner(changed):
     SHORT.to_toml(folder / "arm.toml")
     command = block("A learner", "sh").split()[1:]
     output(folder, *command, *flags(), "--spec=arm.toml", "--out=run")
-    run = Run(folder / "run", CONFIG, SHORT)
+    run = Run(folder / "run", CONFIG, CalibratedArm(SHORT))
     assert run.metrics()[-1]["env_steps"] == 256 and "evaluation/median_mm" in run.metrics()[-1]
     learner = json.loads((run.path / "config.json").read_text())["train"]["learner"]
     assert (learner["name"], learner["random_share"]) == ("restless", 0.2)

@@ -17,7 +17,7 @@ def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "export_run", lambda run, arm, out: policy)
     monkeypatch.setattr(command, "arm_model", lambda *arguments: None)
     monkeypatch.setattr(command, "check_policy", lambda run: None)
-    run = SimpleNamespace(spec=None, s2r=None, held_pressures=lambda: None)
+    run = SimpleNamespace(arm=None)
     monkeypatch.setattr(command.Run, "open", lambda path: run)
     with few_golden_rows():
         assert command.export((tmp_path,), onnx=True, cpp=tmp_path / "cpp") == 0

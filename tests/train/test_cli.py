@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from calib.arm import CalibratedArm
 from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
@@ -21,7 +22,8 @@ from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from tests.train.small import CONFIG, SHORT, flags, new_job
 from train.__main__ import main
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import Checkpoints, RunError
+from train.runs.folder import Run
 from train.runs.lock import sole_trainer
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,7 +43,7 @@ def arm(tmp_path_factory):
 def final_state(out):
     run = Run.open(out)
     job = new_job(run.config, ReachEnv(run.spec, run.config.env))
-    return run.restore(job.shapes())
+    return run.checkpoints.restore(job.shapes())
 
 
 def send_in_epoch_6(number):
@@ -76,7 +78,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
         [sys.executable, "-c", DIES, *command, str(killed)], env={**os.environ, **like_here}, cwd=ROOT
     )
     assert process.returncode == -signal.SIGKILL and not (killed / "evaluation.json").exists()
-    assert Run.open(killed).latest_epoch == 4 and len(Run.open(killed).metrics()) == 6
+    assert Run.open(killed).checkpoints.latest == 4 and len(Run.open(killed).metrics()) == 6
     capsys.readouterr()
     assert main(["reach", "--resume", str(killed)]) == 0
     assert "begins anew" not in capsys.readouterr().out
@@ -128,7 +130,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
 
 
 def test_resume_says_that_a_run_without_a_checkpoint_begins_anew(tmp_path, monkeypatch, capsys):
-    run = Run.create(tmp_path, CONFIG, SHORT)
+    run = Run.create(tmp_path, CONFIG, CalibratedArm(SHORT))
     monkeypatch.setattr("train.runs.run.task_of_run", lambda *_: None)
     monkeypatch.setattr("train.runs.command._train", lambda *_: 0)
     assert main(["reach", "--resume", str(tmp_path)]) == 0
@@ -140,7 +142,7 @@ def test_resume_says_that_a_run_without_a_checkpoint_begins_anew(tmp_path, monke
 
 
 def test_export_reads_the_policy_before_it_distils(tmp_path, monkeypatch, capsys):
-    run = Run.create(tmp_path, CONFIG, SHORT)
+    run = Run.create(tmp_path, CONFIG, CalibratedArm(SHORT))
     monkeypatch.setattr("train.runs.command.arm_model", lambda *_: pytest.fail("distilled"))
     assert main(["export", str(tmp_path)]) == 2
     assert f"{tmp_path}: got no checkpoint, expected one" in capsys.readouterr().err
@@ -154,7 +156,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
     assert main(["reach", *flags(), "--evaluation-epochs=4", "--spec", arm, "--out", str(out)]) == 130
     assert "continue with" in " ".join(capsys.readouterr().out.split())
-    assert Run.open(out).latest_epoch == len(Run.open(out).metrics()) == 7
+    assert Run.open(out).checkpoints.latest == len(Run.open(out).metrics()) == 7
 
 
 @pytest.mark.parametrize("command", ["reach", "imitate", "sweep"])
@@ -246,16 +248,16 @@ def test_imitation_resumes_across_stages_and_hands_its_reward_on(
     assert main([*imitate, str(whole)]) == 0
     assert all((whole / name).exists() for name in ("learning_curve.png", "losses.png", "positions.png"))
 
-    save = Run.save
+    save = Checkpoints.save
 
-    def save_and_die(run, epoch, *rest):
-        save(run, epoch, *rest)
+    def save_and_die(checkpoints, epoch, *rest):
+        save(checkpoints, epoch, *rest)
         if epoch == 4:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Run, "save", save_and_die)
+    monkeypatch.setattr(Checkpoints, "save", save_and_die)
     assert main([*imitate, str(killed)]) == 130
-    monkeypatch.setattr(Run, "save", save)
+    monkeypatch.setattr(Checkpoints, "save", save)
     assert main(["imitate", "--resume", str(killed)]) == 0
     figures = [json.loads((run / "evaluation.json").read_text()) for run in (whole, killed)]
     assert figures[0] == figures[1] and len(figures[0]["error_mm"]) == 6
@@ -270,7 +272,7 @@ def test_imitation_resumes_across_stages_and_hands_its_reward_on(
     other = flags(**changes, hidden=8)  # the agent's layers are taken all the same
     donors = ["--agent", str(whole), "--reward", str(whole)]
     assert main(["imitate", demonstrations, *other, *settings, *donors, "--out", str(narrow)]) == 0
-    kept = [Run.open(run).parts()["reward"] for run in (whole, narrow)]
+    kept = [Run.open(run).checkpoints.parts()["reward"] for run in (whole, narrow)]
     jax.tree.map(np.testing.assert_array_equal, *kept)
     begun = json.loads((narrow / "config.json").read_text())["begins_with"]
     assert begun == {"agent": str(whole), "reward": str(whole)}

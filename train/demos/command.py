@@ -43,7 +43,7 @@ class Record(ArmOptions):
         if self.out.exists():
             raise ConfigError(f"--out: got {self.out}, which is there already, expected a new file")
         # Plan all postures before the arm moves.
-        spec, s2r = self.read_arm(console)
+        spec, s2r, _ = self.read_arm(console)
         arm = names.open_arm(self.arm)
         check_number(arm, spec, f"--arm {self.arm}")
         waypoints, pipe = task(self.task, spec)
@@ -71,7 +71,7 @@ class Check(ArmOptions):
 
     def __call__(self) -> int:
         console = start()
-        spec, _ = self.read_arm(console)
+        spec = self.read_arm(console).spec
         log, findings = read_demonstrations(self.file, spec)
         for text in (*_summary(log, spec), *map(str, findings)):
             _tell(console, text)

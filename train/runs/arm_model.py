@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 import mjx_softarm
+from calib.arm import CalibratedArm
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
 from mjx_softarm.policy.networks import ArmModel, take_networks
@@ -38,32 +39,26 @@ class DistilledArm(NamedTuple):
 
 
 def arm_model(
-    spec: ArmSpec,
-    s2r: S2R | None,
-    folder: Path | None = None,
-    tell: Callable[[str], object] = lambda text: None,
-    held: HeldPressures | None = None,
+    arm: CalibratedArm, folder: Path | None = None, tell: Callable[[str], object] = lambda text: None
 ) -> DistilledArm:
     """Return the model of an arm, which is distilled once in a process.
 
     Args:
-        spec: the arm, calibrated or not.
-        s2r: sim-to-real network of its calibration, if there is one.
+        arm: the arm, calibrated or not.
         folder: keeps the networks in a file, which is used again for the same arm and the same code.
         tell: takes a line before the networks are distilled, unless this process has them already.
-        held: residual pressures of its calibration, if there are some.
 
     Raises:
         SpecError: the arm settles at too few pressures.
     """
-    file, key = folder and folder / ESTIMATORS_FILE, _key(spec, held)
+    file, key = folder and folder / ESTIMATORS_FILE, _key(arm.spec, arm.held)
     # Take the networks of the folder or of this process, else distil them
-    if file and (kept := _read(file, key, spec)):
+    if file and (kept := _read(file, key, arm.spec)):
         networks, errors = kept
     else:
         if key not in _distilled:
             tell("distilling pose and payload estimators for this arm, about a minute ...")
-            _distilled[key] = distil(spec, SEED, held)
+            _distilled[key] = distil(arm.spec, SEED, arm.held)
         distilled = _distilled[key]
         networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
         errors = {
@@ -76,7 +71,7 @@ def arm_model(
             told = {"key": np.asarray(key), "errors_json": np.asarray(json.dumps(errors))}
             with contextlib.suppress(SealedFileError):  # a folder to read only: the next export distils anew
                 write_sealed(file, dict(ChainMap(told, *entries)), _KIND)
-    return DistilledArm(ArmModel(_workspace(spec, s2r), *networks, s2r), errors)
+    return DistilledArm(ArmModel(_workspace(arm.spec, arm.s2r), *networks, arm.s2r), errors)
 
 
 def _read(file: Path, key: str, spec: ArmSpec) -> tuple[tuple[Any, Any, Any], dict[str, Any]] | None:

@@ -26,9 +26,10 @@ from train.options import ArmOptions, NewRunOptions, ReachOptions, named, start
 from train.presets import IMITATION_PRESETS
 from train.runs import run as runs
 from train.runs.arm_model import arm_model
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
 from train.runs.evaluate import N_ACTIONS
 from train.runs.export import check_policy, export_run
+from train.runs.folder import Run
 from train.runs.lock import sole_trainer
 from train.runs.renew import renewed, told_enough
 from train.runs.task import Task, task_of
@@ -59,19 +60,18 @@ class Reach(ReachOptions):
         if getattr(self.config.learner, "from_policy", False) and not (agent and self.config.env.moves):
             raise ConfigError("learner.from_policy: got true, expected it only with --agent RUN, in motion")
         config = self.config.with_policy_of(agent.config) if agent else self.config
-        spec, s2r = self.read_arm(console)
-        held = self.read_pressures(spec)
+        arm = self.read_arm(console)
         console.print("drawing goals from the reachable workspace ...")
-        env = ReachEnv(spec, config.env, s2r)
-        if env.spec != spec:
-            own, given = (arm.structure.links_per_section for arm in (env.spec, spec))
+        env = ReachEnv(arm.spec, config.env, arm.s2r)
+        if env.spec != arm.spec:
+            own, given = (spec.structure.links_per_section for spec in (env.spec, arm.spec))
             console.print(f"the arm has {own} links per section in this run, {given} in its specification")
         task = task_of(config, env, mesh=mesh)
         path = self.out or runs.default_path("reach", self.preset, config.seed)
-        if agent is None:
-            return _train(Run.create(path, config, spec, s2r, held=held), task, console)
-        first = runs.begin_with(task, config.seed, {"agent": agent})
-        run = Run.create(path, config, spec, s2r, None, {"agent": agent.path}, first, held)
+        donors = {"agent": agent} if agent else {}
+        first = runs.begin_with(task, config.seed, donors) if agent else None
+        begins_with = {name: donor.path for name, donor in donors.items()}
+        run = Run.create(path, config, arm, None, begins_with, first, self.preset)
         return _train(run, task, console)
 
 
@@ -120,17 +120,18 @@ class Imitate(NewRunOptions):
             )
         config = dataclasses.replace(self.config, learner=learner)
         # The arm, the demonstrations, and the runs that the new one begins with.
-        spec, s2r = self.read_arm(console)
-        log, _ = read_demonstrations(self.file, spec)
+        arm = self.read_arm(console)
+        log, _ = read_demonstrations(self.file, arm.spec)
         donors = {name: path for name in ("agent", "reward") if (path := getattr(self, name))}
         opened = {name: Run.open(path) for name, path in donors.items()}
         if "agent" in opened:
             config = config.with_policy_of(opened["agent"].config)
         # The first state, and the run.
-        task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
+        env = ReachEnv(arm.spec, config.env, arm.s2r)
+        task = task_of(config, env, from_log(log, arm.spec), mesh)
         first = runs.begin_with(task, config.seed, opened)
         path = self.out or runs.default_path("imitate", self.preset, config.seed)
-        run = Run.create(path, config, spec, s2r, log, donors, first, self.read_pressures(spec))
+        run = Run.create(path, config, arm, log, donors, first, self.preset)
         return _train(run, task, console)
 
 
@@ -178,7 +179,7 @@ def evaluate(
         )
     # Evaluate under them.
     spec = opened.spec.replace(mass={"payload_kg": opened.spec.mass.payload_kg + 1e-3 * payload})
-    summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.s2r), n_actions)(policy)
+    summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.arm.s2r), n_actions)(policy)
     _table(f"{task.title}, {how}", summary, console)
     file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())
@@ -209,15 +210,12 @@ def export(
     for path in folders:
         run, file, keeps = Run.open(path), out, path
         check_policy(run)  # before the networks are distilled, which takes a minute
-        held = run.held_pressures()
         # A later calibration takes the place of the run's
         if calibration:
-            options = ArmOptions(calibration=calibration)
-            later = renewed(run, *options.read_arm(console))
+            later = renewed(run, ArmOptions(calibration=calibration).read_arm(console))
             enough &= told_enough(run, later, calibration, console)
             run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
-            held = options.read_pressures(run.spec)
-        policy = export_run(run, arm_model(run.spec, run.s2r, keeps, console.print, held), file)
+        policy = export_run(run, arm_model(run.arm, keeps, console.print), file)
         console.print(f"policy: {policy}", highlight=False, soft_wrap=True)
         files = export_onnx(policy) if onnx else []
         for file in [*files, *(export_cpp(policy, cpp) if cpp else [])]:
@@ -234,7 +232,7 @@ def _mesh(text: str | None, console: Console) -> Mesh | None:
 
 def _resume(path: Path, mesh: Mesh | None, console: Console) -> int:
     run = Run.open(path)
-    if run.latest_epoch is None:
+    if run.checkpoints.latest is None:
         run.check_begins_anew()
         console.print(f"{path}: no checkpoint yet, the run begins anew", highlight=False, soft_wrap=True)
     return _train(run, runs.task_of_run(run, mesh), console)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import datetime
-import json
 from pathlib import Path
 
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.policy.actor import check_actor, policy_from_actor
 from mjx_softarm.policy.file import save_policy
 from train.runs.arm_model import DistilledArm
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
+from train.runs.folder import Run
 
 
 def check_policy(run: Run) -> None:
@@ -30,7 +30,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
 
     Args:
         run: folder with config and checkpoint.
-        arm: model of the run's arm, as `arm_model` makes it of `run.spec` and `run.s2r`.
+        arm: model of the run's arm, as `arm_model` makes it of `run.arm`.
         path: file to write; `policy.npz` in the run by default.
 
     Raises:
@@ -39,8 +39,8 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
     """
     # Say how the policy came about: the run's config with versions and commit, and the arm's networks.
     provenance = {
-        **json.loads((run.path / "config.json").read_text("utf-8")),
-        "epoch": run.latest_epoch,
+        **run.origin(),
+        "epoch": run.checkpoints.latest,
         "estimator_errors": arm.errors,
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }

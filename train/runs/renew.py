@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from mjx_softarm.sensing.s2r import S2R
-from mjx_softarm.spec import ArmSpec
-from train.config import TrainConfig
-from train.presets import PRESETS
+from calib.arm import CalibratedArm
+from train.agent.registry import LEARNERS, name_of
 from train.runs import run as runs
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
+from train.runs.folder import DEMONSTRATIONS_FILE, Run
 
 # Up to this ratio of median tip errors, on the later arm and on that of the training, and up to this share of
 # goals that saturate besides, no training is needed; by hand. The loop corrects the policy's error by itself.
 ENOUGH, MORE_SATURATED = 1.5, 0.05
 
 
-def renewed(run: Run, spec: ArmSpec, s2r: S2R | None) -> Run:
+def renewed(run: Run, arm: CalibratedArm) -> Run:
     """Return a run with another calibration of its arm.
 
     Its actions stay readings of the same spring lengths: the range of lengths remains that of the training.
@@ -28,12 +26,12 @@ def renewed(run: Run, spec: ArmSpec, s2r: S2R | None) -> Run:
     Raises:
         RunError: it is another arm.
     """
-    counts = [(arm.structure.n_sections, arm.n_chambers, arm.n_springs) for arm in (run.spec, spec)]
+    counts = [(spec.structure.n_sections, spec.n_chambers, spec.n_springs) for spec in (run.spec, arm.spec)]
     if counts[0] != counts[1]:
         expected, got = (f"{s} sections, {c} chambers and {n} springs" for s, c, n in counts)
         raise RunError(f"--calibration: got an arm of {got}, expected {expected}, as in {run.path}")
     limits = {name: getattr(run.spec.springs, name) for name in ("length_min_m", "length_max_m")}
-    return Run(run.path, run.config, spec.replace(springs=limits), s2r)
+    return Run(run.path, run.config, arm._replace(spec=arm.spec.replace(springs=limits)))
 
 
 def told_enough(before: Run, now: Run, calibration: Path, console: Console) -> bool:
@@ -45,33 +43,28 @@ def told_enough(before: Run, now: Run, calibration: Path, console: Console) -> b
         calibration: folder of this calibration.
         console: console to print to.
     """
-    old, new = (runs.task_of_run(run).evaluate(run.policy())[0] for run in (before, now))
-    before_share, now_share = (getattr(summary, "saturated_share", 0.0) for summary in (old, new))
-    more = now_share - before_share
+    # Figures of a finished run are known; those of another are not
+    new = _evaluated(now)
+    old = before.evaluation() or _evaluated(before)
+    more = new.get("saturated_share", 0.0) - old.get("saturated_share", 0.0)
     console.print(
-        f"in simulation, median tip error {old.median_mm:.2f} mm on the arm of the training, "
-        f"{new.median_mm:.2f} mm on the later one; {100 * more:+.1f} % of the goals saturated",
+        f"in simulation, median tip error {old['median_mm']:.2f} mm on the arm of the training, "
+        f"{new['median_mm']:.2f} mm on the later one; {100 * more:+.1f} % of the goals saturated",
         highlight=False,
     )
-    if new.median_mm <= ENOUGH * old.median_mm and more <= MORE_SATURATED:
+    if new["median_mm"] <= ENOUGH * old["median_mm"] and more <= MORE_SATURATED:
         console.print("enough without training")
         return True
-    options = f"--agent {before.path} --calibration {calibration} --preset {_preset_of(before.config)}"
+    # The command that goes on, with the settings that the run began with
+    learns_from_poses = LEARNERS[name_of(before.config.learner)].from_demonstrations
+    task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if learns_from_poses else "reach"
+    preset = before.origin()["preset"]
+    options = f"--agent {before.path} --calibration {calibration}" + (f" --preset {preset}" if preset else "")
     console.print(
-        f"NOT enough: go on training: python -m train reach {options}", highlight=False, soft_wrap=True
+        f"NOT enough: go on training: python -m train {task} {options}", highlight=False, soft_wrap=True
     )
     return False
 
 
-def _preset_of(config: TrainConfig) -> str:
-    """Return the preset from which settings differ least."""
-
-    def settings(tree: dict[str, Any], path: str = "") -> set[str]:
-        found = set()
-        for name, value in tree.items():
-            at = f"{path}.{name}"
-            found |= settings(value, at) if isinstance(value, dict) else {f"{at} {value!r}"}
-        return found
-
-    own = settings(dataclasses.asdict(config))
-    return min(PRESETS, key=lambda name: len(own ^ settings(dataclasses.asdict(PRESETS[name]))))
+def _evaluated(run: Run) -> dict[str, Any]:
+    return runs.task_of_run(run).evaluate(run.policy())[0].to_dict()

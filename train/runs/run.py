@@ -22,7 +22,8 @@ from train.agent.learner import LearnerConfig
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
 from train.epoch.job import TrainState
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
+from train.runs.folder import EVALUATION_FILE, Run
 from train.runs.task import Task, task_of
 
 
@@ -53,9 +54,9 @@ def train(run: Run, task: Task, console: Console) -> Any:
         return epoch, state
 
     def first() -> tuple[int, TrainState]:
-        if run.latest_epoch is None:
+        if run.checkpoints.latest is None:
             return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
-        return run.restore(task.job.like())
+        return run.checkpoints.restore(task.job.like())
 
     (summary,) = train_together(task.job, [(run, task)], begin, run.path, console)
     return summary
@@ -110,7 +111,7 @@ def train_together(
                     row |= evaluation(run, task, learner.policy(own.learner))
                 record(run, board, epoch, row)
                 if own is not None:
-                    run.save(epoch, own, learner.parts(own.learner))
+                    run.checkpoints.save(epoch, own, learner.parts(own.learner))
             show(epoch, _line(rows, shared), due)
             if stop and epoch < n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {path}")
@@ -135,7 +136,7 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     summary, *reached = task.evaluate(policy)
     if is_first_process():
         run.write_poses(*reached)
-        write_json(run.path / "evaluation.json", summary.to_dict())
+        write_json(run.path / EVALUATION_FILE, summary.to_dict())
         plots.save(run.path, task.pictures(run.metrics(), *reached))
     return summary
 
@@ -147,7 +148,7 @@ def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
         RunError: its demonstrations cannot be read.
         ConfigError: it cannot be split evenly over the devices of the mesh.
     """
-    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations(), mesh)
+    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations(), mesh)
 
 
 def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[TrainState, dict[str, Any]]:
@@ -163,7 +164,8 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[TrainS
     """
     state, learner = task.job.init(jax.random.PRNGKey(seed)), task.job.learner
     for option, donor in donors.items():
-        parts = {name: x for name, x in donor.parts().items() if (name == "reward") == (option == "reward")}
+        saved = donor.checkpoints.parts()
+        parts = {name: x for name, x in saved.items() if (name == "reward") == (option == "reward")}
         if not parts:
             expected = "a run of `imitate` that learned one"
             raise RunError(f"{donor.path}: {option}: got none, expected {expected}")

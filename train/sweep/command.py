@@ -42,15 +42,15 @@ class SweepCommand(ReachOptions):
         if self.resume:
             self.check_resume_alone(self.default([]))
             sweep = open_sweep(self.resume)
-            for run in (run for run in sweep.runs if run.latest_epoch is None):
+            for run in (run for run in sweep.runs if run.checkpoints.latest is None):
                 run.check_begins_anew()
             if not sweep.epoch:
                 console.print(f"{self.resume}: no checkpoint of all members yet, the sweep begins anew")
         else:
             members, varied = members_of(self.config, self.seeds, self.vary)
-            spec, s2r = self.read_arm(console)
+            arm = self.read_arm(console)
             path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")
-            sweep = create(path, members, varied, spec, s2r, self.read_pressures(spec))
+            sweep = create(path, members, varied, arm, self.preset)
         console.print(f"sweep: {sweep.path}, {len(sweep.runs)} members", highlight=False)
         # Train all of them, and report.
         try:

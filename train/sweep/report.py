@@ -15,8 +15,9 @@ from rich.text import Text
 
 from mjx_softarm._support.provenance import provenance, write_json
 from train.runs import plots
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
 from train.runs.evaluate import Summary
+from train.runs.folder import EVALUATION_FILE, Run
 from train.sweep.job import setting
 from train.sweep.run import Sweep
 
@@ -66,16 +67,16 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
 
 
 def _figures(run: Run) -> dict[str, Any]:
-    file = run.path / "evaluation.json"
-    if not file.exists():
-        raise RunError(f"{run.path}: got no evaluation.json, expected a finished run")
+    figures = run.evaluation()
+    if figures is None:
+        raise RunError(f"{run.path}: got no {EVALUATION_FILE}, expected a finished run")
     rows = run.metrics()
     further = sorted(run.path.glob("evaluation-*.json"))
     return {
         "seed": run.config.seed,
         "env_steps": rows[-1]["env_steps"],
         "updates": rows[-1]["updates"],
-        **json.loads(file.read_text("utf-8")),
+        **figures,
         **{file.stem: json.loads(file.read_text("utf-8")) for file in further},
     }
 

@@ -14,14 +14,13 @@ from pathlib import Path
 
 from rich.console import Console
 
+from calib.arm import CalibratedArm
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.sensing.held_pressures import HeldPressures
-from mjx_softarm.sensing.s2r import S2R
-from mjx_softarm.spec import ArmSpec
 from train.config import TrainConfig
 from train.epoch.job import TrainState
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
+from train.runs.folder import Run
 from train.runs.run import train_together
 from train.runs.task import Task, task_of
 from train.sweep.job import SweepJob, check_delays, with_env_config
@@ -40,16 +39,15 @@ class Sweep:
     @property
     def epoch(self) -> int:
         """Newest epoch that all members have a checkpoint of; 0 without any."""
-        return max(set.intersection(*(set(run.epochs) for run in self.runs)), default=0)
+        return max(set.intersection(*(set(run.checkpoints.epochs) for run in self.runs)), default=0)
 
 
 def create(
     path: Path,
     members: Mapping[str, TrainConfig],
     varied: Sequence[str],
-    spec: ArmSpec,
-    s2r: S2R | None = None,
-    held: HeldPressures | None = None,
+    arm: CalibratedArm,
+    preset: str | None = None,
 ) -> Sweep:
     """Start the folder of a sweep, whole or not at all.
 
@@ -57,9 +55,8 @@ def create(
         path: folder to make.
         members: configs by the names of their folders.
         varied: settings in which the members differ, besides their seeds.
-        spec: the arm.
-        s2r: sim-to-real network of the arm's calibration, if there is one.
-        held: residual pressures of the arm's calibration, if there are some.
+        arm: the arm, calibrated or not.
+        preset: name of the settings that the members' began with, if they have one.
 
     Raises:
         RunError: there is such a folder already, or it cannot be made.
@@ -73,7 +70,7 @@ def create(
     part = path.with_name(path.name + ".part")
     shutil.rmtree(part, ignore_errors=True)  # left by a start that was interrupted
     for name, config in members.items():
-        Run.create(part / name, config, spec, s2r, held=held)
+        Run.create(part / name, config, arm, preset=preset)
     data = {"members": list(members), "varied": list(varied), "provenance": provenance("train")}
     try:
         write_json(part / SWEEP_FILE, data)
@@ -109,7 +106,7 @@ def train(sweep: Sweep, console: Console) -> None:
     """
     console.print("drawing goals from the reachable workspace ...")
     run = sweep.runs[0]
-    env = ReachEnv(run.spec, run.config.env, run.s2r)
+    env = ReachEnv(run.spec, run.config.env, run.arm.s2r)
     job, tasks = SweepJob([run.config for run in sweep.runs], sweep.varied, env), _tasks(sweep, env)
 
     def begin() -> tuple[int, TrainState]:
@@ -120,7 +117,7 @@ def train(sweep: Sweep, console: Console) -> None:
         if not epoch:
             return 0, job.init()
         like = job.member_shapes()
-        return epoch, job.together([run.restore(like)[1] for run in sweep.runs])
+        return epoch, job.together([run.checkpoints.restore(like)[1] for run in sweep.runs])
 
     members = [(run, tasks[run.config.env]) for run in sweep.runs]
     train_together(job, members, begin, sweep.path, console)

@@ -11,6 +11,7 @@ import optax
 import pytest
 from rich.console import Console
 
+from calib.arm import CalibratedArm
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
 from tests.train.small import SHORT
@@ -21,9 +22,10 @@ from train.agent.registry import LEARNERS, Entry
 from train.agent.tqc import TQCConfig
 from train.config import ConfigError, TrainConfig
 from train.runs.arm_model import DistilledArm
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
 from train.runs.evaluate import Evaluator
 from train.runs.export import export_run
+from train.runs.folder import Run
 from train.runs.run import begin_with, train
 from train.runs.task import task_of
 
@@ -89,7 +91,7 @@ def known():
 
 @pytest.fixture(scope="module")
 def run(task, tmp_path_factory):
-    run = Run.create(tmp_path_factory.mktemp("own") / "run", CONFIG, SHORT)
+    run = Run.create(tmp_path_factory.mktemp("own") / "run", CONFIG, CalibratedArm(SHORT))
     train(run, task, Console(file=io.StringIO()))
     return run
 
@@ -110,7 +112,7 @@ def arm(make_arm_model):
 def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, arm):
     policy = load_policy(export_run(run, arm, tmp_path / "policy.npz"))
     shapes = task.job.shapes()
-    params = task.job.policy(run.restore(shapes)[1])
+    params = task.job.policy(run.checkpoints.restore(shapes)[1])
     obs = np.random.default_rng(0).normal(size=(8, 18)).astype(np.float32)
     (first, bias), (head, head_bias) = policy.layers
     expected = np.tanh(np.maximum(obs @ first + bias, 0.0) @ head + head_bias)
@@ -127,7 +129,7 @@ def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
     learner = TQCConfig(**dataclasses.asdict(SETTINGS))
     other = task_of(dataclasses.replace(CONFIG, learner=learner), task.job.env)
     with pytest.raises(RunError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
-        run.restore(other.job.like())
+        run.checkpoints.restore(other.job.like())
     with pytest.raises(RunError, match=f"{run.path}: got a policy without critics"):
         begin_with(other, 0, {"agent": run})
     with pytest.raises(RunError, match=f"{run.path}: got a donor of policy, expected none"):

@@ -14,13 +14,14 @@ import jax
 import numpy as np
 import pytest
 
+from calib.arm import CalibratedArm
 from mjx_softarm.env import ReachEnv
 from tests.train import small
 from tests.train.small import SHORT, new_job
 from train.__main__ import main
 from train.config import ConfigError
 from train.epoch.devices import mesh_of, split
-from train.runs.checkpoint import Run
+from train.runs.folder import Run
 
 N_DEVICES = 8
 CAPACITY = 4096  # larger than all else that has an axis
@@ -109,11 +110,11 @@ def test_the_epoch_is_traced_once_and_the_replay_stays_where_it_is(jobs, trained
 
 def test_a_checkpoint_of_many_devices_continues_on_one(tmp_path, jobs, trained):
     state, _ = trained[str(N_DEVICES)]
-    run = Run.create(tmp_path / "run", CONFIG, SHORT)
-    run.save(4, state, jobs[str(N_DEVICES)].parts(state))
+    run = Run.create(tmp_path / "run", CONFIG, CalibratedArm(SHORT))
+    run.checkpoints.save(4, state, jobs[str(N_DEVICES)].parts(state))
     expected = jax.device_get(state.learner.actor_params)
     for n, job in jobs.items():
-        epoch, restored = run.restore(job.init(jax.random.PRNGKey(1)))
+        epoch, restored = run.checkpoints.restore(job.init(jax.random.PRNGKey(1)))
         assert epoch == 4
         jax.tree.map(np.testing.assert_array_equal, jax.device_get(restored.learner.actor_params), expected)
         following, _ = job.epoch(restored)
@@ -124,7 +125,7 @@ def test_a_checkpoint_of_many_devices_continues_on_one(tmp_path, jobs, trained):
 _RESTORE = """
 import sys, jax, numpy as np
 from pathlib import Path
-from train.runs.checkpoint import Run
+from train.runs.folder import Run
 run = Run.open(Path(sys.argv[1]))
 assert len(jax.devices()) == 1
 print(sum(float(np.abs(x).sum()) for x in jax.tree.leaves(run.policy())))
@@ -134,7 +135,7 @@ print(sum(float(np.abs(x).sum()) for x in jax.tree.leaves(run.policy())))
 def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, jobs, trained):
     state, _ = trained[str(N_DEVICES)]
     parts = jobs[str(N_DEVICES)].parts(state)
-    Run.create(tmp_path / "run", CONFIG, SHORT).save(4, state, parts)
+    Run.create(tmp_path / "run", CONFIG, CalibratedArm(SHORT)).checkpoints.save(4, state, parts)
     done = subprocess.run(
         [sys.executable, "-c", _RESTORE, str(tmp_path / "run")],
         env={**os.environ, "JAX_NUM_CPU_DEVICES": "1", "JAX_PLATFORMS": "cpu"},

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from calib.arm import CalibratedArm
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.runs import arm_model
 from train.runs.estimator import Distilled, Error
@@ -20,7 +21,7 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
     def model(spec=POLICY.spec):
         """Return the model as another process makes it."""
         monkeypatch.setattr(arm_model, "_distilled", {})
-        return arm_model.arm_model(spec, None, tmp_path, told.append)
+        return arm_model.arm_model(CalibratedArm(spec), tmp_path, told.append)
 
     first, again = model(), model()
     jax.tree.map(np.testing.assert_array_equal, first.model[1:4], again.model[1:4])
@@ -44,5 +45,5 @@ def test_a_folder_to_read_only_changes_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(arm_model, "_distilled", {})
     told = []
     for _ in range(2):  # the second time, the process has the networks
-        assert arm_model.arm_model(POLICY.spec, None, tmp_path / "absent", told.append).errors == {}
+        assert arm_model.arm_model(CalibratedArm(POLICY.spec), tmp_path / "absent", told.append).errors == {}
     assert len(told) == 1

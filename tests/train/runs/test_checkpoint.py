@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
@@ -15,9 +16,10 @@ from train.agent.analytic import AnalyticConfig
 from train.agent.registry import World, learner_of
 from train.config import TrainConfig
 from train.epoch.job import TrainState
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import RunError
+from train.runs.folder import Run
 
-CONFIG = TrainConfig()
+CONFIG, ARM = TrainConfig(), CalibratedArm(ArmSpec.default())
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -29,19 +31,19 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
     with pytest.raises(RunError, match="config.json: got a damaged config or another version's"):
         Run.open(tmp_path)
     with pytest.raises(RunError, match="got a folder with a run, .*--resume"):
-        Run.create(tmp_path, CONFIG, ArmSpec.default())
+        Run.create(tmp_path, CONFIG, ARM)
 
 
 def test_a_run_has_the_links_that_it_was_trained_with(tmp_path):
     config = dataclasses.replace(CONFIG, env=EnvConfig(links_per_section=2))
-    Run.create(tmp_path, config, ArmSpec.default())
+    Run.create(tmp_path, config, ARM)
     assert Run.open(tmp_path).spec.structure.links_per_section == 2
     with pytest.raises(InputError, match="links_per_section: got 2, expected 4, as the sim-to-real network"):
-        Run(tmp_path, config, ArmSpec.default(), s2r=object())
+        Run(tmp_path, config, ARM._replace(s2r=object()))
 
 
 def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
-    run = Run.create(tmp_path, CONFIG, ArmSpec.default())
+    run = Run.create(tmp_path, CONFIG, ARM)
     for epoch in range(1, 5):
         run.log({"epoch": epoch})
     with (tmp_path / "metrics.jsonl").open("a") as file:
@@ -59,11 +61,11 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
     }
     for name, own_config in configs.items():
         learner = learner_of(own_config, World(short_env, demonstrations=shown))
-        run = Run.create(tmp_path / name, config, short_env.spec)
+        run = Run.create(tmp_path / name, config, CalibratedArm(short_env.spec))
         with pytest.raises(RunError, match="got no checkpoint, expected one"):
             run.policy()
         own = jax.jit(learner.init)(jax.random.PRNGKey(0))
-        run.save(1, TrainState(None, own, None, (), zero, zero), learner.parts(own))
+        run.checkpoints.save(1, TrainState(None, own, None, (), zero, zero), learner.parts(own))
         jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(own)))
 
 
@@ -72,9 +74,9 @@ def saved(tmp_path):
     """A run with checkpoints of two epochs, and the shapes of its state."""
     zero = jnp.zeros((), jnp.int32)
     state = TrainState(None, {"weight": jnp.arange(64.0)}, None, (), zero, zero)
-    run = Run.create(tmp_path / "run", CONFIG, ArmSpec.default())
+    run = Run.create(tmp_path / "run", CONFIG, ARM)
     for epoch in (10, 20):
-        run.save(epoch, state, {"policy": {"weight": jnp.arange(64.0)}})
+        run.checkpoints.save(epoch, state, {"policy": {"weight": jnp.arange(64.0)}})
     return run, jax.eval_shape(lambda: state)
 
 
@@ -92,18 +94,18 @@ def test_a_damaged_checkpoint_is_called_so(saved, item, files, spoil):
         spoil(file)
     with pytest.raises(RunError, match=rf"{folder}: got a damaged checkpoint .*back to epoch 10"):
         reopened = Run.open(run.path)
-        reopened.parts() if item == "parts" else reopened.restore(like)
+        reopened.checkpoints.parts() if item == "parts" else reopened.checkpoints.restore(like)
 
 
 def test_a_checkpoint_of_other_sizes_is_called_another_version_s(saved):
     run, like = saved
     other = like._replace(learner={"other": like.learner["weight"]})
     with pytest.raises(RunError, match="got a checkpoint of other parts or sizes"):
-        run.restore(other)
+        run.checkpoints.restore(other)
 
 
 def test_a_run_without_its_checkpoints_begins_anew_only_if_it_had_none(tmp_path):
-    run = Run.create(tmp_path, CONFIG, ArmSpec.default())
+    run = Run.create(tmp_path, CONFIG, ARM)
     for epoch in range(1, CONFIG.evaluation_epochs + 1):
         run.check_begins_anew()  # it may have died before the checkpoint of the last epoch
         run.log({"epoch": epoch})
@@ -114,6 +116,6 @@ def test_a_run_without_its_checkpoints_begins_anew_only_if_it_had_none(tmp_path)
 
 
 def test_a_run_that_began_with_another_s_policy_does_not_begin_anew_without_it(tmp_path):
-    run = Run.create(tmp_path, CONFIG, ArmSpec.default(), begins_with={"agent": tmp_path / "other"})
+    run = Run.create(tmp_path, CONFIG, ARM, begins_with={"agent": tmp_path / "other"})
     with pytest.raises(RunError, match="got no checkpoint of a run with 0 epochs"):
         run.check_begins_anew()

@@ -7,6 +7,7 @@ import re
 import pytest
 
 from benchmarks.accuracy import learning
+from calib.arm import CalibratedArm
 from mjx_softarm._support.provenance import write_json
 from tests.train.small import CONFIG, SHORT
 from train.runs.checkpoint import RunError
@@ -23,7 +24,7 @@ MEDIANS = {(0, 0.5): [9.0, 2.0], (1, 0.5): [7.0, 5.0], (0, 0.9): [8.0, 6.0], (1,
 def finished(tmp_path):
     """A sweep of two seeds and two settings with figures made up."""
     members, varied = members_of(CONFIG, (0, 1), ["learner.gamma=0.5,0.9"])
-    sweep = create(tmp_path / "sweep", members, varied, SHORT)
+    sweep = create(tmp_path / "sweep", members, varied, CalibratedArm(SHORT))
     for run in sweep.runs:
         medians = MEDIANS[run.config.seed, run.config.learner.gamma]
         for epoch, median in enumerate(medians, start=1):

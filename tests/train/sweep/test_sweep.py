@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from calib.arm import CalibratedArm
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from tests.train import small
 from tests.train.small import SHORT, new_job
@@ -16,7 +17,8 @@ from tests.train.sweep.test_report import AT_REST
 from train.__main__ import main
 from train.config import ConfigError, override
 from train.presets import PRESETS
-from train.runs.checkpoint import Run, RunError
+from train.runs.checkpoint import Checkpoints, RunError
+from train.runs.folder import Run
 from train.runs.task import Task
 from train.sweep import run as sweep_run
 from train.sweep.command import members_of
@@ -151,29 +153,31 @@ def ready(job, monkeypatch):
     monkeypatch.setattr(sweep_run, "task_of", lambda config, env: task)
 
 
-def dying(run, epoch, *rest, save=Run.save):
+def dying(checkpoints, epoch, *rest, save=Checkpoints.save):
     """Saves until the second member is to be saved after the sixth epoch."""
-    if epoch == 6 and run.config.seed == 3:
+    if epoch == 6 and Run.open(checkpoints.run).config.seed == 3:
         raise KeyboardInterrupt
-    save(run, epoch, *rest)
+    save(checkpoints, epoch, *rest)
 
 
 def test_a_stopped_sweep_ends_with_the_same_bits(ready, job, members, tmp_path, monkeypatch):
     console = Console(file=io.StringIO())
-    whole, stopped = (create(tmp_path / name, members, VARIABLE, SHORT) for name in ("whole", "stopped"))
+    arm = CalibratedArm(SHORT)
+    whole, stopped = (create(tmp_path / name, members, VARIABLE, arm) for name in ("whole", "stopped"))
     sweep_run.train(whole, console)
     with monkeypatch.context() as patch:
-        patch.setattr(Run, "save", dying)
+        patch.setattr(Checkpoints, "save", dying)
         with pytest.raises(KeyboardInterrupt):
             sweep_run.train(stopped, console)
     resumed = open_sweep(stopped.path)
     assert resumed.varied == VARIABLE and [run.config for run in resumed.runs] == list(members.values())
-    assert [run.epochs for run in resumed.runs] == [[4, 6], [2, 4]] and resumed.epoch == 4
+    assert [run.checkpoints.epochs for run in resumed.runs] == [[4, 6], [2, 4]] and resumed.epoch == 4
     sweep_run.train(resumed, console)
     assert "continuing after epoch 4 of 8" in console.file.getvalue()
 
     for one, other in zip(whole.runs, resumed.runs, strict=True):
-        (epoch, expected), (resumed_epoch, got) = (run.restore(job.member_shapes()) for run in (one, other))
+        saved = (run.checkpoints.restore(job.member_shapes()) for run in (one, other))
+        (epoch, expected), (resumed_epoch, got) = saved
         assert epoch == resumed_epoch == 8
         assert_equal(expected, got)
         rows = [[without_speed(row) for row in run.metrics()] for run in (one, other)]

@@ -1,0 +1,203 @@
+"""A run's folder: its config with versions and commit, its checkpoints, its results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from jax.experimental.multihost_utils import sync_global_devices
+
+from calib.arm import CalibratedArm
+from mjx_softarm._support.files import read_json_lines, replacing
+from mjx_softarm._support.provenance import provenance, write_json
+from mjx_softarm.logs.files import LogError
+from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
+from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.sensing.s2r import S2R_FILE
+from mjx_softarm.spec import ArmSpec
+from train.agent.registry import LEARNERS, name_of
+from train.config import TrainConfig, from_dict, to_dict
+from train.demos.demonstrations import Demonstrations, load_demonstrations
+from train.epoch.devices import is_first_process
+from train.epoch.job import TrainState
+from train.runs.checkpoint import Checkpoints, RunError
+
+CONFIG_FILE, EVALUATION_FILE, METRICS_FILE = "config.json", "evaluation.json", "metrics.jsonl"
+DEMONSTRATIONS_FILE = "demonstrations.npz"
+
+
+class Run:
+    """The folder of one run.
+
+    `config.json` (settings, arm, preset, versions, commit), `s2r.npz` and `pressures.npz` (models of the
+    arm's calibration, if it has them), `demonstrations.npz` (if it learns from them), `checkpoints/`,
+    `metrics.jsonl`, `poses.npz` (of the newest evaluation), `evaluation.json`, pictures, TensorBoard's event
+    files and, once exported, `policy.npz` and `estimators.npz`.
+
+    Several processes that train together share the folder. All of them open it and save checkpoints. The
+    first process alone writes all else.
+    """
+
+    def __init__(self, path: Path, config: TrainConfig, arm: CalibratedArm):
+        self.path, self.config = path, config
+        self.arm = arm._replace(spec=config.env.arm(arm.spec, arm.s2r is not None))
+        self.checkpoints = Checkpoints(path)
+
+    @property
+    def spec(self) -> ArmSpec:
+        """Specification of the arm, with the links of the run."""
+        return self.arm.spec
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        config: TrainConfig,
+        arm: CalibratedArm,
+        demonstrations: Log | None = None,
+        begins_with: dict[str, Path] | None = None,
+        first: tuple[TrainState, dict[str, Any]] | None = None,
+        preset: str | None = None,
+    ) -> Run:
+        """Start a folder.
+
+        Args:
+            path: folder to make.
+            config: all settings.
+            arm: the arm, calibrated or not.
+            demonstrations: rows of the file of demonstrations, if the run learns from one.
+            begins_with: folders of other runs whose parts the first state has, by part.
+            first: first state with its parts, if it is not drawn from the seed.
+            preset: name of the settings that these began with, if they have one.
+
+        Raises:
+            RunError: the folder already holds a run, or cannot be made.
+        """
+        # Refuse a folder with a run. All processes look before the first one writes.
+        if (path / CONFIG_FILE).exists():
+            raise RunError(
+                f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"
+            )
+        sync_global_devices(f"{path} is free")
+        run = cls(path, config, arm)
+        try:
+            # Write what a run begins with, over what a start that was interrupted has left.
+            if is_first_process():
+                path.mkdir(parents=True, exist_ok=True)
+                arm.write_models(path)
+                if demonstrations is not None:
+                    write_log(path / DEMONSTRATIONS_FILE, demonstrations)
+                shutil.rmtree(run.checkpoints.path, ignore_errors=True)
+            sync_global_devices(f"{path} is begun")
+            if first is not None:
+                run.checkpoints.save(0, *first)
+            # Write the config last: with it the folder is a run.
+            data = {
+                "preset": preset,
+                "train": to_dict(config),
+                "spec": run.spec.to_dict(),
+                "s2r": arm.s2r is not None,
+                "begins_with": {name: str(folder) for name, folder in (begins_with or {}).items()},
+                "provenance": provenance("train"),
+            }
+            if is_first_process():
+                write_json(path / CONFIG_FILE, data)
+        except OSError as error:
+            raise RunError(f"{path}: got {error.strerror!r}, expected to write a new folder") from error
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> Run:
+        """Open an existing folder.
+
+        Raises:
+            RunError: there is no run in it, or its config cannot be read.
+            SealedFileError: a model of its calibration cannot be read.
+        """
+        file = path / CONFIG_FILE
+        try:
+            data = json.loads(file.read_text("utf-8"))
+            config, has_s2r = from_dict(data["train"]), data["s2r"]
+            spec = ArmSpec.from_dict(data["spec"], str(file))
+        except OSError as error:
+            raise RunError(f"{file}: got {error.strerror!r}, expected the folder of a run") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise RunError(
+                f"{file}: got a damaged config or another version's ({error}), expected this version's; "
+                "train it anew, or use the version that the file names"
+            ) from error
+        arm = CalibratedArm.with_models(spec, path)
+        if has_s2r and arm.s2r is None:
+            raise RunError(f"{path / S2R_FILE}: got no file, expected the network that the run trains with")
+        return cls(path, config, arm)
+
+    def origin(self) -> dict[str, Any]:
+        """Return the contents of `config.json`."""
+        return json.loads((self.path / CONFIG_FILE).read_text("utf-8"))
+
+    def demonstrations(self) -> Demonstrations | None:
+        """Return the demonstrations that the run learns from, or None.
+
+        Raises:
+            RunError: its file cannot be read.
+        """
+        if not LEARNERS[name_of(self.config.learner)].from_demonstrations:
+            return None
+        try:
+            return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
+        except LogError as error:
+            raise RunError(str(error)) from error
+
+    def policy(self) -> Any:
+        """Return the parameters of the newest checkpoint's policy; see `Checkpoints.parts`."""
+        return self.checkpoints.parts()["policy"]
+
+    def check_begins_anew(self) -> None:
+        """Check that a run without a checkpoint was stopped before its first one.
+
+        Raises:
+            RunError: it had a checkpoint: it began with another run's, or its metrics go further.
+        """
+        done = max((row["epoch"] for row in self.metrics()), default=0)
+        # A process may have died after the metrics of an epoch and before its checkpoint.
+        if self.origin()["begins_with"] or any(map(self.config.evaluates_after, range(1, done))):
+            raise RunError(
+                f"{self.checkpoints.path}: got no checkpoint of a run with {done} epochs in {METRICS_FILE}, "
+                "expected one; bring the folder back, or train anew with another --out"
+            )
+
+    def rewind(self, epoch: int) -> None:
+        """Delete checkpoints and metrics later than an epoch, before the run continues from there."""
+        self.checkpoints.rewind(epoch)
+        if not is_first_process():
+            return
+        rows = [row for row in self.metrics() if row["epoch"] <= epoch]
+        with replacing(self.path / METRICS_FILE) as part:
+            part.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
+
+    def log(self, row: dict[str, Any]) -> None:
+        """Append a line to `metrics.jsonl`."""
+        if is_first_process():
+            with (self.path / METRICS_FILE).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Return the lines of `metrics.jsonl`, up to the first incomplete one."""
+        return read_json_lines(self.path / METRICS_FILE)
+
+    def write_poses(self, *results: Any) -> None:
+        """Write poses at goals, and around the circle if an evaluation found them, for the view."""
+        if is_first_process():
+            found = [getattr(result, "reached", result) for result in results]
+            sets = {
+                name: PosePairs(at.goal, at.pose, (at.saturated_chambers > 0) | ~at.settled)
+                for name, at in zip(("goals", "circle"), found, strict=False)
+            }
+            write_pose_pairs(self.path, sets)
+
+    def evaluation(self) -> dict[str, Any] | None:
+        """Return the figures in `evaluation.json`, None where the run is not finished."""
+        file = self.path / EVALUATION_FILE
+        return json.loads(file.read_text("utf-8")) if file.exists() else None
