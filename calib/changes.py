@@ -20,7 +20,7 @@ import numpy as np
 from calib.arm import CalibratedArm
 from calib.fit.blocks import held_out_blocks
 from calib.fit.held_pressures import without_redundant_part
-from calib.fit.leastsquares import QUANTILE, Problem, Solution, fit
+from calib.fit.leastsquares import QUANTILE, Problem, Solution, fit, rms_of
 from calib.fit.pose_errors import PoseErrors, change_errors
 from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import StaticPoses
@@ -84,7 +84,7 @@ def fit_changes(arm: CalibratedArm, poses: StaticPoses, seed: int = 0) -> Change
     old = np.array(spec.per_chamber(spec.chambers.stiffness_n_per_m))
     mean = np.repeat([0.0, 1.0, 1.0 / n_chambers, 0.0], [n, 1, n_chambers, 1 + n_chambers])
     # On twins the loop's arrivals need 0.3 kPa less than recorded poses: all stiffnesses may be off by that
-    shared = OFFSET_KPA[0] / _rms(_elastic_kpa(spec, poses.spring_m + zero_m))
+    shared = OFFSET_KPA[0] / rms_of(_elastic_kpa(spec, poses.spring_m + zero_m))
     unmodelled = np.array(spec.unmodelled.pressure_kpa or np.zeros(n_chambers)) + offset_kpa
     return Changes(
         spec=spec.replace(
@@ -100,8 +100,8 @@ def fit_changes(arm: CalibratedArm, poses: StaticPoses, seed: int = 0) -> Change
         n=poses.n,
         before=_pose_errors(before),
         after=_pose_errors(after),
-        before_kpa=_rms(before[:, 6:]),
-        after_kpa=_rms(after[:, 6:]),
+        before_kpa=rms_of(before[:, 6:]),
+        after_kpa=rms_of(after[:, 6:]),
     )
 
 
@@ -166,7 +166,3 @@ def _elastic_kpa(spec: ArmSpec, spring_m: np.ndarray) -> np.ndarray:
 def _pose_errors(error: np.ndarray) -> PoseErrors:
     """Sum up the errors (m, 6) [mm, rad] of tips that were measured, of arms that settled."""
     return change_errors(error[np.isfinite(error[:, :6]).all(axis=1), :6] / _TURN)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))

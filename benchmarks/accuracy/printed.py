@@ -28,7 +28,7 @@ from train.demos.demonstrations import Demonstrations
 from train.demos.expert import Expert
 from train.demos.waypoints import task as waypoints_of
 from train.runs import plots
-from train.runs.checkpoint import Run
+from train.runs.folder import Run
 from train.runs.positions import PositionEvaluator
 from train.runs.run import task_of_run
 

@@ -24,8 +24,8 @@ from mjx_softarm.policy.file import load_policy
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import Build
 from mjx_softarm.twin.rod_twin import RodTwin
-from train.runs.checkpoint import Run
 from train.runs.evaluate import Evaluator
+from train.runs.folder import Run
 from train.runs.run import task_of_run
 
 N_ACTIONS, ACTION_S = 12, 0.5  # of each goal, in motion

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
 from calib.fit.blocks import held_out_blocks
+from calib.fit.leastsquares import rms_of
 from mjx_softarm.control import allocation, chambers_of_springs
 from mjx_softarm.sensing.held_pressures import HeldPressures, kernel, residual, sections_of
 from mjx_softarm.spec import ArmSpec
@@ -60,7 +61,9 @@ def fit_held_pressures(
     variance = found.share[..., None] * np.diagonal(judged.covariance_kpa2, axis1=1, axis2=2)
     # Fit to all poses.
     process = _process(spec, spring_m, simulated_kpa, left_kpa)
-    return PressureFit(process, _rms(left_kpa[held_out]), _rms(after_kpa), float(np.sqrt(variance.mean())))
+    return PressureFit(
+        process, rms_of(left_kpa[held_out]), rms_of(after_kpa), float(np.sqrt(variance.mean()))
+    )
 
 
 def _process(
@@ -107,7 +110,3 @@ def without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec:
     plane = np.eye(spec.n_chambers) - matrices.redundant
     push = plane @ (area * pressure_kpa)[..., None]
     return (np.linalg.pinv(plane @ (area[..., None] * plane)) @ push)[..., 0]
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -66,25 +66,34 @@ class Solution(NamedTuple):
 
 def fit(model: Model, problem: Problem) -> Solution:
     """Minimise Huber's loss of the errors over their scales, started from x = 0."""
-    prior = np.diag(1.0 / problem.prior)
-
-    @functools.lru_cache(maxsize=2)  # SciPy asks for errors and Jacobian one after the other
-    def evaluate(x: bytes) -> tuple[np.ndarray, np.ndarray]:
-        return model(np.frombuffer(x))
-
-    def errors(x: np.ndarray) -> np.ndarray:
-        return np.append(_scaled(*evaluate(x.tobytes()), scale, problem)[0], x @ prior)
-
-    def jacobian(x: np.ndarray) -> np.ndarray:
-        slope = _scaled(*evaluate(x.tobytes()), scale, problem)[1]
-        return np.concatenate([slope.reshape(-1, len(x)), prior])
-
-    options: dict[str, Any] = {"jac": jacobian, "f_scale": problem.huber, "x_scale": problem.prior}
+    model = _remembering(model)
     x, scale = np.zeros(len(problem.prior)), problem.scale
     for loss in ROUNDS:
-        x = least_squares(errors, x, loss=loss, **options, **TOLERANCES).x
-        scale = _scales(evaluate(x.tobytes())[0], problem)
-    return refine(lambda x: evaluate(x.tobytes()), x, problem)
+        x = descend(model, x, scale, problem, loss, TOLERANCES)
+        scale = _scales(model(x)[0], problem)
+    return refine(model, x, problem)
+
+
+def descend(
+    model: Model, x: np.ndarray, scale: np.ndarray, problem: Problem, loss: str, end: dict[str, Any]
+) -> np.ndarray:
+    """Minimise a loss of the errors from x (p,), with scales (n_groups,) that stay; `end` is SciPy's."""
+    model, prior = _remembering(model), np.diag(1.0 / problem.prior)
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return np.append(_scaled(*model(x), scale, problem)[0], x @ prior)
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([_scaled(*model(x), scale, problem)[1].reshape(-1, len(x)), prior])
+
+    options: dict[str, Any] = {"jac": jacobian, "f_scale": problem.huber, "x_scale": problem.prior, **end}
+    return least_squares(errors, x, loss=loss, **options).x
+
+
+def _remembering(model: Model) -> Model:
+    """Return a model that keeps its last answers: SciPy asks for errors and Jacobian one after the other."""
+    answers = functools.lru_cache(maxsize=2)(lambda x: model(np.frombuffer(x)))
+    return lambda x: answers(x.tobytes())
 
 
 def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
@@ -113,6 +122,11 @@ def solution_at(x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem:
     scale = _scales(error, problem)
     covariance, newton_step, decrement = _covariance(error, jacobian, x, scale, problem)
     return Solution(x, covariance, scale, newton_step, decrement)
+
+
+def rms_of(values: np.ndarray) -> float:
+    """Return the root mean square of the finite values."""
+    return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))
 
 
 def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:

@@ -34,6 +34,11 @@ def over_arms(function: Callable, mesh: Mesh | None = None, n_shared: int = 0) -
     return of_all
 
 
+def choose_arms(chosen: Array, yes: Any, no: Any) -> Any:
+    """Return a tree of arrays (n, ...): rows of one tree where arms are chosen (n,), else of another."""
+    return jax.tree.map(lambda x, y: jnp.where(chosen.reshape((-1,) + (1,) * (x.ndim - 1)), x, y), yes, no)
+
+
 class Outcome(NamedTuple):
     """Outcome of one action of each arm, before any reset."""
 
@@ -79,9 +84,5 @@ class VectorEnv:
         over = terminated | truncated | ~valid
 
         # New episodes where the last one is over; metrics are always those of the action
-        fresh = self.reset(key)
-        following = jax.tree.map(
-            lambda new, old: jnp.where(over.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), fresh, after
-        )
-        following = following.replace(metrics=after.metrics)
+        following = choose_arms(over, self.reset(key), after).replace(metrics=after.metrics)
         return following, after, Outcome(after.obs, after.reward, terminated, truncated, valid)

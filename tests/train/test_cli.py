@@ -106,9 +106,10 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
     brief = Schedule(10, 4e-3, 256)
-    smallest = {"N_TRAINING": 512, "N_HELD_OUT": 64, "SCHEDULE": brief, "PAYLOADS": (0.0,)}
-    for name, smaller in smallest.items():  # how exact it is, test_estimator asks
-        monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
+    smallest = {"N_TRAINING": 512, "N_JUDGING": 256, "N_HELD_OUT": 64}
+    for name, smaller in (smallest | {"SCHEDULE": brief, "PAYLOADS": (0.0,)}).items():
+        monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)  # how exact it is, test_estimator asks
+    monkeypatch.setattr("train.runs.arm_model.N_WORKSPACE", 256)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
 

@@ -36,10 +36,10 @@ from mjx_softarm._support import draws
 from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
-from mjx_softarm.env.vector import VectorEnv, over_arms
+from mjx_softarm.env.vector import VectorEnv, choose_arms, over_arms
 from mjx_softarm.mdp import rewards
 from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_settings
-from train.agent.networks import Actor, check_same_shapes, mode, widened
+from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
 
 Params = Any  # a flax parameter tree
 EARLY = 0.2  # weight of the mean cost of all actions beside that of the last: the tip shall arrive soon
@@ -131,7 +131,7 @@ class Analytic(Learner):
         params = self.actor.init(key_actor, jnp.zeros((1, self.env.observation_size)))
         return AnalyticState(
             actor_params=params,
-            mean_actor_params=jax.tree.map(jnp.copy, params),  # so that the state can be donated
+            mean_actor_params=own_buffers(params),
             opt_state=self.optimizer.init(params),
             n_steps=jnp.zeros((), jnp.int32),
             arms=self.arms.reset(key_arms),
@@ -145,7 +145,7 @@ class Analytic(Learner):
         """
         params = widened(parts["policy"], self.env.observation_size)
         check_same_shapes("actor", params, state.actor_params)
-        return state._replace(actor_params=params, mean_actor_params=jax.tree.map(jnp.copy, params))
+        return state._replace(actor_params=params, mean_actor_params=own_buffers(params))
 
     def act(self, state: AnalyticState, obs: Array, key: Array) -> Explored:
         """Return the policy's actions (..., A) at obs (..., O): nothing needs to be explored."""
@@ -178,8 +178,7 @@ class Analytic(Learner):
         after = ahead.after
 
         # Descend.
-        change, opt_state = self.optimizer.update(gradient, state.opt_state, state.actor_params)
-        actor_params = optax.apply_updates(state.actor_params, change)
+        actor_params, opt_state = descend(self.optimizer, gradient, state.opt_state, state.actor_params)
         newest = 1.0 / (1.0 + self.config.mean_share * state.n_steps)
         next_state = AnalyticState(
             actor_params=actor_params,
@@ -226,7 +225,4 @@ class Analytic(Learner):
         key_new, key_reset = jax.random.split(key)
         new = draws.uniform(key_new, (self.arms.n,)) < self.config.new_share
         new |= ~after.info["valid"]
-        fresh = self.arms.reset(key_reset)
-        return jax.tree.map(
-            lambda x, y: jnp.where(new.reshape((-1,) + (1,) * (x.ndim - 1)), x, y), fresh, after
-        )
+        return choose_arms(new, self.arms.reset(key_reset), after)

@@ -25,6 +25,7 @@ import optax
 from jax import Array
 
 from train.agent.learner import check_settings
+from train.agent.networks import descend
 
 Score = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...)
 Penalised = Literal["logit", "probability"]
@@ -123,8 +124,7 @@ class Gail:
             return entropy + self.config.gradient_penalty * penalty, metrics
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.params)
-        updates, opt_state = self.optimizer.update(grads, state.opt_state, state.params)
-        return DiscriminatorState(optax.apply_updates(state.params, updates), opt_state), metrics
+        return DiscriminatorState(*descend(self.optimizer, grads, state.opt_state, state.params)), metrics
 
     def _scaled(self, obs: Array, action: Array) -> tuple[Array, Array]:
         return self.config.input_scale * obs, self.config.input_scale * action

@@ -5,6 +5,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import optax
 
 from mjx_softarm._support.mlp import Activation, activate
 from mjx_softarm.mdp.observation import OBS_SIZE
@@ -52,6 +53,14 @@ def widened(params: Any, obs_size: int) -> Any:
     unseen = max(0, obs_size - OBS_SIZE) if len(first["kernel"]) == OBS_SIZE else 0
     first["kernel"] = jnp.pad(first["kernel"], ((0, unseen), (0, 0)))
     return params
+
+
+def descend(
+    optimizer: optax.GradientTransformation, gradient: Any, opt_state: optax.OptState, params: Any
+) -> tuple[Any, optax.OptState]:
+    """Take one step down a gradient; return parameters and optimiser state."""
+    updates, opt_state = optimizer.update(gradient, opt_state, params)
+    return optax.apply_updates(params, updates), opt_state
 
 
 def own_buffers(tree: Any) -> Any:

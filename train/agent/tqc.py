@@ -21,7 +21,6 @@ from jax import Array
 from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
 from train.agent import prior
-from train.agent.descent import descend, learning_rate
 from train.agent.hindsight import HindsightConfig, relabel
 from train.agent.learner import (
     Experience,
@@ -33,7 +32,16 @@ from train.agent.learner import (
     check_settings,
 )
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
-from train.agent.networks import Actor, Critics, check_same_shapes, given_actor, mode, own_buffers, squash
+from train.agent.networks import (
+    Actor,
+    Critics,
+    check_same_shapes,
+    descend,
+    given_actor,
+    mode,
+    own_buffers,
+    squash,
+)
 from train.agent.prediction import PredictiveCritics, Predictor
 
 Params = Any  # a flax parameter tree
@@ -116,7 +124,9 @@ class TQC:
         )
         if config.n_ahead:
             self.critics = PredictiveCritics(self.critics, Predictor(config.hidden_critic), config.n_ahead)
-        rate = learning_rate(config, config.learning_rate, config.learning_rate_end)
+        rate, end = config.learning_rate, config.learning_rate_end
+        if end != 1.0:  # a half cosine over the run
+            rate = optax.cosine_decay_schedule(rate, config.n_decay_updates, end)
         self.optimizer = self.actor_optimizer = optax.adam(rate)
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         if config.from_policy:

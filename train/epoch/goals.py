@@ -20,6 +20,7 @@ from jax import Array
 from mjx_softarm._support import draws, xla
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.env.state import State
+from mjx_softarm.env.vector import choose_arms
 from mjx_softarm.mechanics.workspace import Pool
 from train.agent.imitation import ImitationConfig
 from train.config import ConfigError
@@ -56,8 +57,7 @@ class DemonstratedGoals:
             start = jnp.where(follows, self.before[goal], start)
             at_start = jax.tree.map(lambda x: x[start], self.static_poses)
             fresh = jax.vmap(self.env.put)(arm, at_start)._replace(goal=self.positions[goal])
-        new = arm.n_steps == 0
-        arm = jax.tree.map(lambda x, y: jnp.where(new.reshape((-1,) + (1,) * (x.ndim - 1)), x, y), fresh, arm)
+        arm = choose_arms(arm.n_steps == 0, fresh, arm)
         return arms.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, arm.goal, arm.sensed))
 
     def of_stage(self, epoch: int) -> np.ndarray:

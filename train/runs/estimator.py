@@ -91,27 +91,22 @@ def distil(spec: ArmSpec, seed: int, held: HeldPressures | None = None) -> Disti
     """
     if seed == HELD_OUT_SEED:
         raise ValueError(f"seed: got {seed}, which draws the held-out equilibria, expected another")
-    keys = jax.random.split(jax.random.key(seed), 7)
+    keys = _keys(seed)
     # Learn the pose of the arm as specified, then how a load changes it.
-    poses = _with_load(sample_workspace(_stronger(spec), N_TRAINING, seed), spec.mass.payload_kg)
-    loaded = _loaded(spec, held, _loads(spec, seed), seed)
+    pool = sample_workspace(_stronger(spec), N_TRAINING, seed)
+    load_kg = jnp.full(len(pool.pose), spec.mass.payload_kg)
+    poses = LoadedPool(load_kg, pool.pressure_kpa, pool.spring_m, pool.pose)
+    loaded = loaded_poses(spec, held, N_TRAINING, seed)
     estimator = _fit(_first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
     estimator = _fit(estimator, _pose_loss, loaded, keys[2], "load_layers")
     # Learn the load of arms that are off, and the springs of the unloaded arm.
-    load_estimator = _fit(_first_load_estimator(spec, loaded, keys[3]), _load_loss, loaded, keys[4])
-    # The error is learned from poses that the load network does not know, on which it is larger.
-    others = _loaded(spec, held, _loads(spec, seed + 1)[: CANDIDATES_PER_POSE * N_JUDGING], seed + 1)
-    load_estimator = _fit(load_estimator, _load_sd_loss, others, jax.random.fold_in(keys[4], 1), "sd_layers")
+    load_estimator = fit_load_estimator(spec, held, loaded, seed)
     unloaded = _as_measured(spec, held, sample_workspace(spec, N_TRAINING, seed))
     springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
     # Test them.
-    networks = (estimator, load_estimator, springs)
-    pose, load, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), networks)
-    return Distilled(pose, load, springs, _errors(pose, load, springs, spec, held))
-
-
-def _with_load(pool: Pool, load_kg: float) -> LoadedPool:
-    return LoadedPool(jnp.full(len(pool.pose), load_kg), pool.pressure_kpa, pool.spring_m, pool.pose)
+    learned = Distilled(estimator, load_estimator, springs, {})
+    learned = jax.tree.map(lambda x: np.asarray(x, np.float32), learned)
+    return learned._replace(errors=_errors(learned, spec, held))
 
 
 def _as_measured(spec: ArmSpec, held: HeldPressures | None, pool: Any) -> Any:
@@ -119,11 +114,32 @@ def _as_measured(spec: ArmSpec, held: HeldPressures | None, pool: Any) -> Any:
     return _with_pressures(spec, held, pool, np.zeros_like(pool.pressure_kpa))
 
 
+def loaded_poses(spec: ArmSpec, held: HeldPressures | None, n: int, seed: int) -> LoadedPool:
+    """Draw n poses with payloads for the networks to learn from; see `distil`."""
+    share = np.random.default_rng([seed, 1]).uniform(LOWEST, HIGHEST, CANDIDATES_PER_POSE * n)
+    return _loaded(spec, held, _load_max_kg(spec) * share, seed)
+
+
+def fit_load_estimator(
+    spec: ArmSpec, held: HeldPressures | None, loaded: LoadedPool, seed: int
+) -> LoadEstimator:
+    """Return the payload network of an arm, learned from `loaded_poses`; arguments as of `distil`."""
+    keys = _keys(seed)
+    learned = _fit(_first_load_estimator(spec, loaded, keys[3]), _load_loss, loaded, keys[4])
+    # The error is learned from poses that the load network does not know, on which it is larger.
+    others = loaded_poses(spec, held, N_JUDGING, seed + 1)
+    return _fit(learned, _load_sd_loss, others, jax.random.fold_in(keys[4], 1), "sd_layers")
+
+
+def _keys(seed: int) -> Array:
+    return jax.random.split(jax.random.key(seed), 7)
+
+
 def _loaded(spec: ArmSpec, held: HeldPressures | None, many_kg: np.ndarray, seed: int) -> LoadedPool:
     """Draw poses of arms with payloads [kg], which are off as far as the calibration does not tell."""
     pool = sample_loaded(spec, many_kg, CHAMBERS_OFF if held is None else 0.0, seed)
     if held is None:
-        return _with_pressures(spec, None, pool, np.zeros_like(pool.pressure_kpa))
+        return _as_measured(spec, None, pool)
     # The effect of the payload is the difference to the arm without it, held at the same springs.
     light = simulate_poses(spec, np.asarray(pool.spring_m))
     pool = jax.tree.map(lambda values: np.asarray(values)[light.valid], pool)
@@ -146,12 +162,6 @@ def _with_pressures(
     if held is not None:
         kpa = held_kpa(held, spring_m, kpa - effect_kpa, effect_kpa, rng)
     return pool._replace(pressure_kpa=jnp.asarray(kpa + spec.unmodelled_kpa(spring_m), jnp.float32))
-
-
-def _loads(spec: ArmSpec, seed: int) -> np.ndarray:
-    """Draw payloads (m,) [kg] of the candidates for equilibria with a payload."""
-    rng = np.random.default_rng([seed, 1])
-    return _load_max_kg(spec) * rng.uniform(LOWEST, HIGHEST, CANDIDATES_PER_POSE * N_TRAINING)
 
 
 def _load_max_kg(spec: ArmSpec) -> float:
@@ -255,13 +265,7 @@ def _fit(
     return network._replace(**{layers: weights})
 
 
-def _errors(
-    estimator: PoseEstimator,
-    load_estimator: LoadEstimator,
-    spring_model: SpringModel,
-    spec: ArmSpec,
-    held: HeldPressures | None,
-) -> dict[str, dict[float, Error]]:
+def _errors(learned: Distilled, spec: ArmSpec, held: HeldPressures | None) -> dict[str, dict[float, Error]]:
     """Return errors by payload on top of the specification's.
 
     `tip_mm` and `turn_deg` are errors of the pose network with the true load. `load_kg` is the error of arms
@@ -281,17 +285,17 @@ def _errors(
             held_out = sample_loaded(spec, many_kg, 0.0, HELD_OUT_SEED)
         pool = jax.tree.map(np.asarray, _as_measured(spec, held, held_out))
         position_m, rotation = frame_from_pose(pool.pose)
-        guess = estimate_frame(estimator, pool.spring_m, load_kg)
+        guess = estimate_frame(learned.estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
-        springs = np.abs(expected_springs(spring_model, pool.pressure_kpa) - pool.spring_m)
+        springs = np.abs(expected_springs(learned.spring_model, pool.pressure_kpa) - pool.spring_m)
         found["tip_mm"][payload_kg] = _error(1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1))
         found["turn_deg"][payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
         found["spring_mm"][payload_kg] = _error(1e3 * springs.max(axis=-1))
         # Estimate the load of arms whose chambers are off.
         off = _loaded(spec, held, many_kg, HELD_OUT_SEED)
-        estimate_kg = np.asarray(estimate_load(load_estimator, off.spring_m, off.pressure_kpa))
+        estimate_kg = np.asarray(estimate_load(learned.load_estimator, off.spring_m, off.pressure_kpa))
         found["load_kg"][payload_kg] = _error(np.abs(estimate_kg - load_kg))
-        widths_kg = load_half_width(load_estimator, off.spring_m, off.pressure_kpa)
+        widths_kg = load_half_width(learned.load_estimator, off.spring_m, off.pressure_kpa)
         found["load_half_width_kg"][payload_kg] = _error(np.asarray(widths_kg))
     return found
 

@@ -62,7 +62,7 @@ def create(
         RunError: there is such a folder already, or it cannot be made.
         ConfigError: dead times of the members differ too much.
     """
-    check_delays(spec, list(members.values()))
+    check_delays(arm.spec, list(members.values()))
     # Make the members' folders beside the final one, and rename the whole at the end.
     if path.exists():
         expected = f"a new folder; --resume {path} continues this one"

@@ -11,17 +11,24 @@ whose command never changed has the numbers of the others. Each chamber has an o
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calib.fit.blocks import held_out_blocks
-from calib.fit.leastsquares import NOT_CONVERGED, QUANTILE, Model, Problem, Solution, solution_at
+from calib.fit.leastsquares import (
+    NOT_CONVERGED,
+    QUANTILE,
+    Model,
+    Problem,
+    Solution,
+    descend,
+    rms_of,
+    solution_at,
+)
 from calib.fit.motion.tracks import Runs, Track
 from mjx_softarm.pneumatics import LONGEST_DELAY_S, PAPER_PUMP, Actuators, Pump, Regulator
 from mjx_softarm.spec import ArmSpec
@@ -77,7 +84,7 @@ def fit_actuators(tracks: Sequence[Track], spec: ArmSpec, seed: int = 0) -> Actu
     kinds = {"regulator": regulator, "pump": pump, "specification": spec.actuators}
     errors = {name: runs.errors(actuators.per_chamber(spec.n_chambers)) for name, actuators in kinds.items()}
     errors["command"] = runs.clusters([t.commanded_kpa - t.pressure_kpa for t in tracks])
-    rms = {name: _rms(error[held_out]) for name, error in errors.items()}
+    rms = {name: rms_of(error[held_out]) for name, error in errors.items()}
     bound = {name: max(MARGIN * value, value + SMALL_KPA) for name, value in rms.items()}
     simpler = "specification" if rms["specification"] <= bound["pump"] else "pump"
     chosen = simpler if rms[simpler] <= bound["regulator"] else "regulator"
@@ -89,9 +96,9 @@ def fit_actuators(tracks: Sequence[Track], spec: ArmSpec, seed: int = 0) -> Actu
         spec=with_actuators(spec, kinds[chosen]),
         chosen=chosen,
         half_width_95=_half_widths(regulator, solution),
-        in_sample_rms_kpa=_rms(errors[chosen][~held_out]),
+        in_sample_rms_kpa=rms_of(errors[chosen][~held_out]),
         held_out_rms_kpa=rms,
-        chamber_rms_kpa=np.array([_rms(error[own[:, k], k]) for k in range(spec.n_chambers)]),
+        chamber_rms_kpa=np.array([rms_of(error[own[:, k], k]) for k in range(spec.n_chambers)]),
         n_tracks=len(tracks),
         time_s=sum(len(track.pressure_kpa) for track in tracks) / spec.control.rate_hz,
     )
@@ -167,21 +174,7 @@ def _fit(model: Model, prior: np.ndarray, rows: int) -> Solution:
     """
     scale = np.array([SCALE_KPA * rows**0.5])
     problem = Problem(prior, np.zeros(rows, int), scale, min_scale=scale, huber=NO_OUTLIERS)
-
-    @functools.lru_cache(maxsize=2)  # SciPy asks for errors and Jacobian one after the other
-    def evaluate(x: bytes) -> tuple[np.ndarray, np.ndarray]:
-        error, slope = model(np.frombuffer(x))
-        error, slope = np.nan_to_num(error), np.nan_to_num(slope)
-        return error.ravel() / scale, slope.reshape(-1, len(prior)) / scale
-
-    def errors(x: np.ndarray) -> np.ndarray:
-        return np.append(evaluate(x.tobytes())[0], x / prior)
-
-    def jacobian(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([evaluate(x.tobytes())[1], np.diag(1.0 / prior)])
-
-    options: Any = {"jac": jacobian, "x_scale": prior, **TOLERANCES}
-    x = least_squares(errors, np.zeros(len(prior)), **options).x
+    x = descend(model, np.zeros(len(prior)), scale, problem, "linear", TOLERANCES)
     return solution_at(x, *model(x), problem)
 
 
@@ -200,7 +193,7 @@ def _start(runs: Runs, used: np.ndarray) -> dict[str, np.ndarray]:
     grid = [{**numbers, "deadband_kpa": DEADBAND_KPA} for numbers in grid]
     starts = [{name: np.full(c, value) for name, value in numbers.items()} for numbers in grid]
     errors = runs.errors_of([Regulator(**numbers, offset_kpa=offset) for numbers in starts])
-    rms = np.array([_rms(error[used]) for error in errors])
+    rms = np.array([rms_of(error[used]) for error in errors])
     return starts[int(np.argmax(rms <= ALIKE * rms.min()))]
 
 
@@ -223,10 +216,6 @@ def _half_widths(regulator: Regulator, solution: Solution) -> dict[str, np.ndarr
         widths[name] = QUANTILE * np.sqrt(np.maximum(variance, 0.0)) * getattr(regulator, name)
     offset = n + np.arange(c)
     return widths | {"offset_kpa": QUANTILE * np.sqrt(covariance[offset, offset])}
-
-
-def _rms(error: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(error**2)))
 
 
 def _warnings(done: ActuatorFit, solution: Solution) -> tuple[str, ...]:

@@ -156,9 +156,16 @@ def test_a_log_of_a_moving_goal_has_poses_at_its_stops_only():
         np.testing.assert_allclose(poses.with_lengths(SPEC).spring_m[k], at_m, atol=1e-4)
 
 
-def test_equal_goals_in_a_row_give_one_pose():
+def test_equal_goals_in_a_row_give_the_last_pose_with_each_payload():
     run = go(LinearArm(), goals=[GOALS[0], GOALS[0], GOALS[1]])
-    assert len(run.arrivals) == 3 and find_static_poses([run.log], SPEC)[0].n == 2
+    poses, row_uses = find_static_poses([run.log], SPEC)
+    assert poses.n == 2 < len(run.arrivals) and sum(row_uses.values()) == len(run.log)
+    for pressure_kpa, arrival in zip(poses.pressure_kpa, run.arrivals[1:], strict=True):
+        rows = slice(arrival.row + 1 - CONTROLLER.window, arrival.row + 1)
+        np.testing.assert_allclose(pressure_kpa, run.log.pressure_kpa[rows].mean(axis=0))
+    carried_kg = np.where(np.arange(len(run.log)) > run.arrivals[0].row, 0.1, 0.0)
+    carried = dataclasses.replace(run.log, payload_kg=carried_kg)
+    np.testing.assert_array_equal(find_static_poses([carried], SPEC)[0].payload_kg, [0.0, 0.1, 0.1])
 
 
 def test_springs_under_a_slow_law_are_watched_for_longer_and_those_near_the_axis_more_closely():

@@ -20,15 +20,15 @@ from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
 from mjx_softarm.sensing.load import estimate_load, load_half_width
 from mjx_softarm.sensing.pose import frame_from_pose
 from train.runs import estimator as module
-from train.runs.estimator import PAYLOADS, distil
+from train.runs.estimator import PAYLOADS, distil, fit_load_estimator, loaded_poses
 
 SPEC = ArmSpec.default()
 N, N_ARMS = SPEC.n_chambers, 512
 
 
 def small(monkeypatch, n_updates):
-    monkeypatch.setattr(module, "N_TRAINING", 8192)
-    monkeypatch.setattr(module, "N_HELD_OUT", 512)
+    for name, n in {"N_TRAINING": 8192, "N_JUDGING": 2048, "N_HELD_OUT": 512}.items():
+        monkeypatch.setattr(module, name, n)
     monkeypatch.setattr(module, "SCHEDULE", module.SCHEDULE._replace(n_updates=n_updates))
 
 
@@ -90,8 +90,8 @@ def test_payload_is_estimated_and_then_the_pose(distilled, payload_kg):
 
 def test_same_seed_same_networks(monkeypatch):
     small(monkeypatch, 20)
-    monkeypatch.setattr(module, "N_TRAINING", 512)
-    monkeypatch.setattr(module, "PAYLOADS", (0.0,))
+    for name, few in {"N_TRAINING": 512, "N_JUDGING": 256, "PAYLOADS": (0.0,)}.items():
+        monkeypatch.setattr(module, name, few)
     one, same = (jax.tree.leaves(distil(SPEC, 3)[:3]) for _ in range(2))
     assert all(x.dtype == np.float32 for x in one)
     assert all(np.array_equal(x, y) for x, y in zip(one, same, strict=True))
@@ -160,7 +160,6 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
 ):
     """Residual pressures are an offset, as older calibrations have it, and those of chambers that harden."""
     small(monkeypatch, 3000)
-    monkeypatch.setattr(module, "PAYLOADS", (0.0,))
     spec = SPEC.replace(unmodelled={"pressure_kpa": tuple(np.random.default_rng(5).normal(0, 2, N))})
 
     def hardening(spring_m):
@@ -170,7 +169,7 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
     rows, others = (jax.tree.map(lambda x, k=k: x[k::2], pool) for k in range(2))
     measured_kpa = rows.pressure_kpa + hardening(rows.spring_m)
     held = fit_held_pressures(spec, rows.spring_m, measured_kpa, rows.pressure_kpa).held
-    found = distil(spec, 0, held).load_estimator
+    found = fit_load_estimator(spec, held, loaded_poses(spec, held, module.N_TRAINING, 0), 0)
     loaded = jax.device_get(sample_workspace(SPEC.replace(mass={"payload_kg": 0.5}), N_ARMS, 79))
     for arms, payload_kg in ((others, 0.0), (loaded, 0.5)):
         kpa = arms.pressure_kpa + hardening(arms.spring_m) + spec.unmodelled_kpa(arms.spring_m)

@@ -259,7 +259,7 @@ def test_members_whose_commands_wait_for_other_times_are_refused(tmp_path):
     with pytest.raises(
         ConfigError, match="got delay_max_s 0, .* and delay_max_s 0.05, .* same control period"
     ):
-        create(tmp_path / "sweep", members, varied, SHORT)
+        create(tmp_path / "sweep", members, varied, CalibratedArm(SHORT))
     assert not any(tmp_path.iterdir())
 
 
