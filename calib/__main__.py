@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from mjx_softarm._support import cli
@@ -101,6 +102,7 @@ def _run(
         fit_compensation: fit the circuit's compensation inductance, too
         seed: seed of all random draws
     """
+    from calib.report.page import warning_lines
     from calib.run import calibrate, go_on, load_calibration, refuse_existing, write_calibration
     from calib.steps import STEPS, springs
     from mjx_softarm._support import xla
@@ -124,14 +126,14 @@ def _run(
     calibration = go_on(known, read, seed, tell) if known else calibrate(read, arm, seed, steps, tell)
     # Write the folder, and print the reasons not to trust it.
     write_calibration(out, calibration, [str(finding) for finding in findings], provenance("calib"))
-    for section in calibration.sections:
-        for warning in section.warnings:
-            print(f"warning: {section.title}: {warning}")
-        for note in section.notes:
-            print(f"note: {section.title}: {note}")
-    print(f"report: {out / 'report.html'}")
-    after = "train export RUN" if since else "train reach --preset analytic"
-    print(f"next: python -m {after} --calibration {out}")
+    lines = warning_lines(calibration.sections)
+    lines += [f"note: {section.title}: {note}" for section in calibration.sections for note in section.notes]
+    print("\n".join([*lines, f"report: {out / 'report.html'}"]))
+    if known and calibration.spec == known.spec:
+        print(f"next: nothing to export; {since} stays the calibration of this arm")
+    else:
+        after = "train export RUN" if since else "train reach --preset analytic"
+        print(f"next: python -m {after} --calibration {out}")
     return 1 if any(section.warnings for section in calibration.sections) else 0
 
 
@@ -168,8 +170,9 @@ def _plan(
     print(f"{found.n_informative} poses for the fit, {found.n_payload} for the payload, {n_others} others")
     print(f"unknown directions, as far as the fitted model tells: {now} now, {then} with these poses")
     if found.half_width_kg:
-        known_g, then_g = (f"{1e3 * kg:.0f} g" for kg in found.half_width_kg)
-        print(f"payload, known at half of the workspace's poses to {known_g} now, {then_g} with these poses")
+        (none, largest), (then_none, then_largest) = 1e3 * np.array(found.half_width_kg)
+        print(f"no payload, told at half of the poses: within {none:.0f} g now, {then_none:.0f} g with these")
+        print(f"the largest, at 95 %: within {largest:.0f} g now, {then_largest:.0f} g with these")
     print(f"plan: {out}")
     print(f"next: python -m mjx_softarm.deploy record --plan {out} --arm ARM --spec SPEC --out LOG")
     return 0

@@ -1,12 +1,13 @@
 """Poses to record next: first poses that tell a calibration's unknown directions, then poses far from others.
 
-The parameters x are those of `calib.fit.parameters`. J holds the derivatives of all measurements by x, over
-the scales of their errors. The covariance of x is the inverse of the prior's precision plus the sum of J^T J
-over the poses. Poses are chosen one by one among candidates, each time the pose that reduces the sum of the
-variances most, in units of the tolerances, until every direction is expected to be known, but at most half
-of the poses. Where payloads are not known well (`calib.fit.payload`), the rest of this half is chosen to tell
-them. The others are drawn as in k-means++: by the square of the distance to the nearest pose, times the error
-of the sim-to-real network there.
+The parameters x are those of `calib.fit.parameters`, and their covariance is that of the calibration's fit. J
+holds the derivatives of all measurements by x, over the scales of their errors. A pose that is recorded adds
+J^T J / M^2 to the precision of x, with a margin M, since errors are not independent. Poses are chosen one by
+one among candidates, each time the pose that reduces the sum of the variances most, in units of the
+tolerances, until every direction is expected to be known, but at most half of the poses. Where payloads are
+not known well (`calib.fit.payload`), the rest of this half is chosen to tell them. The others are drawn as in
+k-means++: by the square of the distance to the nearest pose, times the error of the sim-to-real network
+there.
 
 Source: Fedorov, "Theory of Optimal Experiments", 1972 (A-optimal design); Arthur, Vassilvitskii, "k-means++",
 SODA 2007.
@@ -22,7 +23,13 @@ import numpy as np
 from calib.fit.equilibrium import N_KINDS, error_groups, simulate, unmeasured
 from calib.fit.leastsquares import QUANTILE
 from calib.fit.parameters import priors, tolerances
-from calib.fit.payload import choose_for_payload, informed, payload_half_widths, payload_poses
+from calib.fit.payload import (
+    choose_for_payload,
+    informed,
+    payload_half_widths,
+    payload_poses,
+    told_widths,
+)
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
 from mjx_softarm.control import allocation
 from mjx_softarm.mechanics.excitation import random_pressures
@@ -34,7 +41,7 @@ KIND, RECORDED_FILE = "recorded", "recorded.npz"  # file in the folder of a cali
 SHARE_FAR = 0.5  # least share of the poses that are drawn by their distance
 KNOWN_SHARE = 0.02  # half-width of no payload, in largest payloads, from which no pose is spent on it
 MAX_CANDIDATES = 1500
-MARGIN = 2.0  # intervals of fits over intervals of this covariance, which takes errors for independent
+MARGIN = 2.0  # M: intervals of fits over intervals by J^T J, which takes errors for independent
 N_NEAREST = 8  # nearest poses whose errors are averaged
 MAX_ERROR_RATIO = 2.0  # largest weight: mean error of the nearest poses over the mean of all
 
@@ -46,6 +53,7 @@ class Recorded(NamedTuple):
     payload_kg: np.ndarray  # (n,)
     error_mm: np.ndarray  # (n,) error of the tip, with the sim-to-real network if there is one
     scale: np.ndarray  # (2, 3) robust errors, see `calib.fit.chambers.ChamberFit`; (2, 4) with markers
+    covariance: np.ndarray | None = None  # (p, p) of the fit's parameters; None in older files
 
 
 class Plan(NamedTuple):
@@ -55,12 +63,16 @@ class Plan(NamedTuple):
     n_informative: int
     n_payload: int
     n_unknown: tuple[int, int]  # unknown directions now, and expected with the plan
-    half_width_kg: tuple[float, float] | None  # median of a payload's 95 % intervals now, and expected
+    # `calib.fit.payload.told_widths` now, and expected
+    half_width_kg: tuple[tuple[float, float], tuple[float, float]] | None
 
 
 def save_recorded(path: Path, recorded: Recorded) -> None:
     """Write the poses of a calibration; raises as `write_sealed` does."""
-    write_sealed(path, entries_of(KIND, recorded), KIND)
+    entries = entries_of(KIND, recorded)
+    if recorded.covariance is None:
+        del entries[f"{KIND}.covariance"]
+    write_sealed(path, entries, KIND)
 
 
 def load_recorded(path: Path, n_chambers: int) -> Recorded:
@@ -69,13 +81,16 @@ def load_recorded(path: Path, n_chambers: int) -> Recorded:
     Raises:
         SealedFileError: the file is missing, damaged, or of another arm.
     """
-    entries = Entries(read_sealed(path, KIND, "python -m calib run"), str(path))
+    arrays = read_sealed(path, KIND, "python -m calib run")
+    entries = Entries(arrays, str(path))
     shapes = {
         "pressure_kpa": ((None, n_chambers),),
         "payload_kg": ((None,),),
         "error_mm": ((None,),),
         "scale": ((2, 3), (2, 4)),
     }
+    if f"{KIND}.covariance" in arrays:
+        shapes["covariance"] = ((None, None),)
     found = Recorded(**{name: entries.take(f"{KIND}.{name}", np.float64, *s) for name, s in shapes.items()})
     entries.finish(1)
     return found
@@ -91,19 +106,15 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressur
         seed: seed of the candidates and of the draw.
         held: residual pressures of its calibration, if there are some.
     """
-    # Compute the covariance of the calibration.
-    rng = np.random.default_rng(seed)
+    # Draw candidates, and choose informative poses among them.
+    rng, tolerance = np.random.default_rng(seed), tolerances(spec)
     candidates, spring_m = _candidates(spec, min(20 * n, MAX_CANDIDATES), rng)
-    rows = _derivatives(spec, recorded.pressure_kpa, recorded.payload_kg, recorded.scale)
-    tolerance = tolerances(spec)
-    prior = np.diag((tolerance / priors(spec)) ** 2)
-    scaled = rows.reshape(-1, len(tolerance)) * tolerance
-    covariance = np.linalg.inv(prior + scaled.T @ scaled)
+    covariance = _covariance(spec, recorded)
     before = n_unknown(covariance)
-    # Choose informative poses, then poses for the payload.
     payload = np.full(len(candidates), spec.mass.payload_kg)
-    options = _derivatives(spec, candidates, payload, recorded.scale) * tolerance
+    options = _derivatives(spec, candidates, payload, recorded.scale) * tolerance / MARGIN
     informative, covariance = choose_informative(options, covariance, n - round(SHARE_FAR * n))
+    # Choose poses for the payload, where it is not known.
     telling, widths_kg = np.array([], int), None
     if held is not None:
         states = spring_m, candidates
@@ -112,7 +123,7 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressur
             n_left = n - round(SHARE_FAR * n) - len(informative)
             telling = choose_for_payload(known, at, *states, n_left, informative)
         then = informed(known, *(x[telling] for x in states))
-        before_kg, then_kg = (float(np.median(payload_half_widths(x, at, 0.0))) for x in (held, then))
+        before_kg, then_kg = (told_widths(x, at, spec.mass.largest_payload_kg) for x in (held, then))
         widths_kg = before_kg, then_kg
     # Choose poses far from all others; all but the first add to the information, too.
     chosen = np.concatenate([informative, telling])
@@ -124,9 +135,19 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressur
     return Plan(pressure_kpa, len(informative), len(telling), unknown, widths_kg)
 
 
+def _covariance(spec: ArmSpec, recorded: Recorded) -> np.ndarray:
+    """Return the covariance (p, p) of a calibration's parameters, in units of their tolerances."""
+    tolerance = tolerances(spec)
+    if recorded.covariance is not None:
+        return recorded.covariance / np.outer(tolerance, tolerance)
+    rows = _derivatives(spec, recorded.pressure_kpa, recorded.payload_kg, recorded.scale)
+    scaled, prior = rows.reshape(-1, len(tolerance)) * tolerance, np.diag((tolerance / priors(spec)) ** 2)
+    return MARGIN**2 * np.linalg.inv(prior + scaled.T @ scaled)
+
+
 def n_unknown(covariance: np.ndarray) -> int:
     """Return the number of directions of a covariance (p, p), in units of tolerances, that are not known."""
-    widths = MARGIN * QUANTILE * np.sqrt(np.linalg.eigvalsh(covariance))
+    widths = QUANTILE * np.sqrt(np.linalg.eigvalsh(covariance))
     return int(np.count_nonzero(widths > 1.0))
 
 

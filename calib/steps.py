@@ -23,7 +23,7 @@ from calib.fit.motion.actuators import fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
-from calib.fit.payload import payload_half_widths, payload_poses
+from calib.fit.payload import payload_poses, told_widths
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
@@ -47,6 +47,7 @@ class Extras(TypedDict, total=False):
     """Results beside the specification. A step adds some; a later step may replace them."""
 
     scale: np.ndarray  # (2, 3) or (2, 4) robust errors, see `calib.fit.chambers.ChamberFit`
+    covariance: np.ndarray  # (p, p) of the parameters of chambers, backbone and mounting
     error_mm: np.ndarray  # (n,) tip error at each static pose
     s2r: S2R
     held: HeldPressures  # residual pressures of the unloaded arm
@@ -107,7 +108,7 @@ def chambers(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult
     # Give a pose at which the simulated arm finds no rest the mean error.
     known = np.isfinite(fit.tip_error_mm)
     error_mm = np.where(known, fit.tip_error_mm, np.mean(fit.tip_error_mm[known]))
-    extras = Extras(scale=fit.scale, error_mm=error_mm)
+    extras = Extras(scale=fit.scale, covariance=fit.covariance, error_mm=error_mm)
     return StepResult(fit.spec if fit.is_better else spec, section, extras)
 
 
@@ -173,8 +174,8 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     extras["held"] = held.held
     spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
     largest_kg = spec.mass.largest_payload_kg
-    width_kg = payload_half_widths(held.held, payload_poses(spec), largest_kg)
-    section = sections.with_pressures(section, held, width_kg, LOOP.load_known * largest_kg)
+    widths_kg = told_widths(held.held, payload_poses(spec), largest_kg)
+    section = sections.with_pressures(section, held, widths_kg, LOOP.load_known * largest_kg)
     return StepResult(spec, section, extras)
 
 

@@ -17,6 +17,7 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.spec import ArmSpec
 
 FIRMWARE = Path(__file__).parent / "deploy" / "drivers" / "firmware" / "firmware.ino"
+FAR_LIMIT = 0.25  # distance of a limit from the springs' range, as a share of it, that is told; by hand
 MAX_COMBINATIONS, N_RANDOM = 1_000_000, 3**9  # of pressures; as many as those of the paper's arm
 
 
@@ -40,7 +41,7 @@ def _spec(arm: str = "paper", out: Path = Path("arm.toml"), force: bool = False)
     if out.exists() and not force:
         raise InputError(f"--out: got {out}, which exists already, expected a new file, or --force")
     out.write_text(shipped_arm(arm), "utf-8")
-    print(f"wrote {out}; edit it and use it with --spec {out}")
+    print(f"wrote {out}; edit it, its name first, and use it with --spec {out}")
     return 0
 
 
@@ -69,9 +70,12 @@ def _picture(
     pressure_kpa = np.broadcast_to(np.asarray(pressures), (1, arm.n_chambers))
     found = settle_many(arm, pressure_kpa)
     if not found.settled[0]:
+        where, check = "--pressures", ""
+        if not any(pressures):
+            where, check = str(spec or arm.name), "; check the units of its masses, lengths and stiffnesses"
         raise InputError(
-            f"--pressures: got an arm that does not settle, with {found.residual[0]:g} N or N m left: "
-            f"{SettleResult(found.result[0]).text}; expected an equilibrium"
+            f"{where}: got an arm that does not settle, with {found.residual[0]:g} N or N m left: "
+            f"{SettleResult(found.result[0]).text}; expected an equilibrium{check}"
         )
     with Renderer(build_model(arm)) as renderer:
         image = renderer.draw(np.asarray(found.q[0]))
@@ -115,8 +119,27 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     print("coverage of the YZ plane")
     print(f"  lateral (y)   {lateral:6.1f} mm{beside[0]}")
     print(f"  vertical (z)  {vertical:6.1f} mm{beside[1]}")
+    _tell_lengths(arm, np.asarray(found.spring_m, float)[found.settled])
     print(f"wrote {out / 'workspace.png'}")
     return 0
+
+
+def _tell_lengths(spec: ArmSpec, spring_m: np.ndarray) -> None:
+    """Print the lengths that springs (n, n_springs) [m] reach, and say where their limits are far from it."""
+    low_m, high_m = spec.springs.length_min_m, spec.springs.length_max_m
+    n = spec.structure.n_sections if isinstance(low_m, tuple) or isinstance(high_m, tuple) else 1
+    parts = np.split(spring_m, n, axis=1)
+    for k in range(n):
+        reached = np.array([parts[k].min(), parts[k].max()])
+        limits = np.array([spec.per_section(low_m)[k], spec.per_section(high_m)[k]])
+        far = np.abs(limits - reached).max() > FAR_LIMIT * np.ptp(reached)
+        (shortest, longest), (low, high) = 1e3 * reached, 1e3 * limits
+        print(
+            f"springs{f' of section {k}' * (n > 1)}: {shortest:.0f} to {longest:.0f} mm; "
+            f"springs.length_min_m and length_max_m: {low:.0f} to {high:.0f} mm"
+            + ", expected about what they reach"
+            * bool(far)
+        )
 
 
 def _firmware(spec: cli.SpecFile = None, out: Path = Path("softarm")) -> int:

@@ -34,6 +34,7 @@ from mjx_softarm.spec_tables import (
 )
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
+MOST_RATIO = 3.0  # of a spring's length and that of its section, either way; more is a slip
 
 
 @dataclass(frozen=True)
@@ -223,6 +224,21 @@ class ArmSpec:
             if not np.all(np.less(least, greatest)):
                 raise SpecError(
                     f"{source}: {group}.{low}: got {least!r}, expected less than {high} ({greatest!r})"
+                )
+
+        # Springs have about the length of their sections
+        section_m = self.geometry.section_length_m
+        for name, low, high in (
+            ("rest_length_m", 1.0 / MOST_RATIO, MOST_RATIO),
+            ("length_min_m", 0.0, MOST_RATIO),
+            ("length_max_m", 1.0 / MOST_RATIO, np.inf),
+        ):
+            length_m = getattr(self.springs, name)
+            ratio = np.divide(self.per_section(length_m), self.per_section(section_m))
+            if not np.all((low <= ratio) & (ratio <= high)):
+                beside = f"with geometry.section_length_m {section_m!r}"
+                raise SpecError(
+                    f"{source}: springs.{name}: got {length_m!r} {beside}, expected lengths that go together"
                 )
 
         # The sensor can read every length that may be commanded

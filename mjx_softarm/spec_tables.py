@@ -22,6 +22,11 @@ LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
 # Lag of a section's shape over damping by stiffness of its backbone: chambers and weight stiffen it, too.
 # Of the paper's arm, simulated on the circle in 20 s.
 SHAPE_SHARE = 0.65
+# Upper bounds that no soft arm exceeds, but its number in another unit does.
+LENGTH = {"high": 2.0, "unit": "m, not mm"}
+MASS = {"high": 50.0, "unit": "kg, not g"}
+AREA = {"high": 0.1, "unit": "m2, not cm2 or mm2"}
+PRESSURE = {"high": 2000.0, "unit": "kPa, not Pa"}
 PAPER_S_ARM_KG = 4.7  # mass of the paper's arm, which carries up to 1 kg
 
 
@@ -43,21 +48,21 @@ class Geometry:
     them. Where springs are fewer, the first chamber has one, and every k-th chamber from there.
     """
 
-    section_length_m: PerSection = positive(per="sections")
-    chamber_radius_m: PerSection = positive(per="sections")
-    spring_radius_m: PerSection = positive(per="sections")
+    section_length_m: PerSection = positive(per="sections", **LENGTH)
+    chamber_radius_m: PerSection = positive(per="sections", **LENGTH)
+    spring_radius_m: PerSection = positive(per="sections", **LENGTH)
     first_chamber_deg: PerSection = anything(per="sections", low=-360.0, high=360.0)
-    chamber_diameter_m: PerSection = positive(per="sections")
+    chamber_diameter_m: PerSection = positive(per="sections", **LENGTH)
 
 
 @dataclass(frozen=True)
 class Mass:
     """Masses. The arm's own mass is one number, spread evenly over all links, or one for each section."""
 
-    arm_kg: PerSection = positive(per="sections")
-    gripper_kg: float = not_negative()
-    gripper_length_m: float = positive()
-    payload_kg: float = not_negative()
+    arm_kg: PerSection = positive(per="sections", **MASS)
+    gripper_kg: float = not_negative(**MASS)
+    gripper_length_m: float = positive(**LENGTH)
+    payload_kg: float = not_negative(**MASS)
 
     @property
     def largest_payload_kg(self) -> float:
@@ -70,13 +75,13 @@ class Mass:
 class Chambers:
     """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length))."""
 
-    area_m2: PerChamber = positive(per="chambers")
+    area_m2: PerChamber = positive(per="chambers", **AREA)
     area_slope_m: PerChamber = anything(per="chambers")
     stiffness_n_per_m: PerChamber = positive(per="chambers")
     damping_ns_per_m: PerChamber = not_negative(per="chambers")
     length_offset_m: PerChamber = anything(per="chambers", low=-0.1, high=0.1)
-    pressure_min_kpa: float = anything(low=-101.325)
-    pressure_max_kpa: float = anything(low=-101.325)
+    pressure_min_kpa: float = anything(low=-101.325, **PRESSURE)
+    pressure_max_kpa: float = anything(low=-101.325, **PRESSURE)
 
 
 @dataclass(frozen=True)
@@ -101,9 +106,9 @@ class Springs:
 
     stiffness_n_per_m: PerSection = not_negative(per="sections")
     damping_ns_per_m: PerSection = not_negative(per="sections")
-    rest_length_m: PerSection = positive(per="sections")
-    length_min_m: PerSection = positive(per="sections")
-    length_max_m: PerSection = positive(per="sections")
+    rest_length_m: PerSection = positive(per="sections", **LENGTH)
+    length_min_m: PerSection = positive(per="sections", **LENGTH)
+    length_max_m: PerSection = positive(per="sections", **LENGTH)
 
 
 @dataclass(frozen=True)

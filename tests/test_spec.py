@@ -6,6 +6,7 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tomli_w
 from hypothesis import given, settings
@@ -81,29 +82,32 @@ def test_another_number_of_sections_needs_no_new_scalars(spec):
     assert text == "replace: sensor.beta: got 9 numbers, expected one, or one for each of the 6 springs"
 
 
+SECTIONS = ", or a list with one for each of the sections"
 REFUSED = [
     # field, value, what the message expects
-    ("mass.gripper_length_m", "heavy", "a number > 0"),
-    ("mass.gripper_length_m", True, "a number > 0"),
-    ("mass.gripper_length_m", 0.0, "a number > 0"),
-    ("mass.arm_kg", math.nan, "a number > 0, or a list with one for each of the sections"),
-    ("mass.gripper_length_m", 10**400, "a number > 0"),
-    ("mass.payload_kg", -0.1, "a number >= 0"),
+    ("mass.gripper_length_m", "heavy", "a number > 0 and <= 2 (m, not mm)"),
+    ("mass.gripper_length_m", True, "a number > 0 and <= 2 (m, not mm)"),
+    ("mass.gripper_length_m", 0.0, "a number > 0 and <= 2 (m, not mm)"),
+    ("mass.gripper_length_m", 100.0, "a number > 0 and <= 2 (m, not mm)"),
+    ("backbone.axial_stiffness_n_per_m", math.nan, f"a number > 0{SECTIONS}"),
+    ("mass.gripper_length_m", 10**400, "a number > 0 and <= 2 (m, not mm)"),
+    ("mass.payload_kg", -0.1, "a number >= 0 and <= 50 (kg, not g)"),
+    ("mass.gripper_kg", 300.0, "a number >= 0 and <= 50 (kg, not g)"),
+    ("geometry.section_length_m", 200.0, f"a number > 0 and <= 2 (m, not mm){SECTIONS}"),
     ("structure.n_sections", 3.0, "a whole number >= 1 and <= 100"),
     (
         "structure.chambers_per_section",
         13,
         "a whole number >= 3 (fewer bend a section in one plane) and <= 12",
     ),
-    ("mass.arm_kg", 1e39, "sizes from 1.2e-38 to 3.4e+38, which float32 holds"),
+    ("backbone.axial_stiffness_n_per_m", 1e39, "sizes from 1.2e-38 to 3.4e+38, which float32 holds"),
     ("mounting.base_turn_deg", [1.0], "a list of 3 numbers"),
-    ("chambers.pressure_min_kpa", -102.0, "a number >= -101.325"),
+    ("chambers.pressure_min_kpa", -102.0, "a number >= -101.325 and <= 2000 (kPa, not Pa)"),
     (
         "chambers.length_offset_m",
         0.2,
         "a number >= -0.1 and <= 0.1, or a list with one for each of the chambers",
     ),
-    ("sensor.beta", [0.93] * 8 + [math.nan], "a number > 0, or a list with one for each of the springs"),
     ("sensor.beta", [0.93] * 8, "one, or one for each of the 9 springs"),
     ("sensor.kind", "laser", "coil or draw_wire"),
     ("name", {"first": "arm"}, "a text"),
@@ -116,6 +120,24 @@ def test_a_refused_value_is_named_with_file_field_and_expectation(data, path, va
     text = message_of(ArmSpec.from_dict, changed(data, path, value), "my.toml")
     got = f"{len(value)} numbers" if "each of the 9" in expected else repr(value)
     assert text == f"my.toml: {path}: got {got}, expected {expected}"
+
+
+@pytest.mark.parametrize("number", [math.nan, np.float64(math.nan)])
+def test_a_refused_number_of_a_list_is_named_by_its_place(data, number):
+    beta = [0.93] * 8 + [number]
+    text = message_of(ArmSpec.from_dict, changed(data, "sensor.beta", beta), "my.toml")
+    expected = "expected a number > 0, or a list with one for each of the springs"
+    assert text == f"my.toml: sensor.beta[8]: got nan, {expected}"
+
+
+@pytest.mark.parametrize("field, length_m", [("rest", 0.02), ("rest", 0.7), ("min", 0.65), ("max", 0.06)])
+def test_springs_far_from_the_length_of_their_sections_are_refused(data, field, length_m):
+    name = f"{field}_length_m" if field == "rest" else f"length_{field}_m"
+    for limit, other_m in (("min", 0.05), ("max", 0.7)):
+        data = changed(data, f"springs.length_{limit}_m", other_m)
+    text = message_of(ArmSpec.from_dict, changed(data, f"springs.{name}", length_m), "my.toml")
+    beside = "with geometry.section_length_m 0.2, expected lengths that go together"
+    assert text == f"my.toml: springs.{name}: got {length_m} {beside}"
 
 
 @pytest.mark.parametrize(
@@ -188,7 +210,10 @@ def test_files_that_cannot_be_used_are_named(tmp_path, spec):
         assert text.startswith(f"{path}: got ") and text.endswith(", expected TOML")
     spec.to_toml(path)
     path.write_text(path.read_text("utf-8").replace("gripper_kg = 0.45", "gripper_kg = nan"), "utf-8")
-    assert message_of(ArmSpec.from_toml, path) == f"{path}: mass.gripper_kg: got nan, expected a number >= 0"
+    assert (
+        message_of(ArmSpec.from_toml, path)
+        == f"{path}: mass.gripper_kg: got nan, expected a number >= 0 and <= 50 (kg, not g)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -210,7 +235,7 @@ POSITIVE = st.floats(1e-6, 1e6)
 @few
 @given(
     name=st.text(max_size=12),
-    mass_kg=POSITIVE,
+    mass_kg=st.floats(1e-6, 50.0),
     stiffness=st.one_of(POSITIVE, st.lists(POSITIVE, min_size=9, max_size=9).map(tuple)),
     gains=st.tuples(POSITIVE, POSITIVE, POSITIVE),
 )

@@ -61,6 +61,16 @@ def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float
     return QUANTILE / np.sqrt(information)
 
 
+def told_widths(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tuple[float, float]:
+    """Return how well payloads are told over the workspace, as half-widths [kg] of 95 % intervals.
+
+    Returns:
+        Median over the poses without a payload; 95 % of the poses with the largest payload have less.
+    """
+    none, largest = (payload_half_widths(held, at, kg) for kg in (0.0, largest_kg))
+    return float(np.median(none)), float(np.quantile(largest, 0.95))
+
+
 def informed(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray) -> HeldPressures:
     """Return a process that knows k poses more, whose residuals are its own means there."""
     if not len(spring_m):

@@ -36,6 +36,19 @@ class Section:
     notes: tuple[str, ...] = ()  # facts that are worth a look, but no reason to distrust the step
 
 
+def warning_lines(sections: Sequence[Section]) -> list[str]:
+    """Return the warnings for the terminal: a line for each remedy, with its first reason and their count."""
+    reasons: dict[str, list[str]] = {}
+    for section in sections:
+        for warning in section.warnings:
+            reason, _, remedy = warning.partition("\n")[0].rpartition(": ")
+            reasons.setdefault(remedy, []).append(f"{section.title}: {reason}")
+    return [
+        f"warning: {first}" + f", and {len(others)} more" * bool(others) + f": {remedy}"
+        for remedy, (first, *others) in reasons.items()
+    ]
+
+
 def to_json(
     sections: Sequence[Section], findings: Sequence[str], provenance: dict[str, Any]
 ) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import PressureFit
 from calib.fit.markers import MarkerLimits
-from calib.fit.motion.actuators import ActuatorFit
+from calib.fit.motion.actuators import MARGIN, SMALL_KPA, ActuatorFit
 from calib.fit.motion.damping import DampingFit
 from calib.fit.motion.shape import ShapeFit
 from calib.fit.parameters import BENDING, without_effect
@@ -110,7 +110,7 @@ def chambers(fit: ChamberFit) -> Section:
         + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
         (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
-        plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
+        plain(fit, "spec", "covariance", "poses", "is_held_out", "tip_error_mm", "chamber_m")
         | {"values": values | {BENDING: bending} | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
         fit.notes,
@@ -182,7 +182,7 @@ def actuators(fit: ActuatorFit) -> Section:
         "Actuators",
         f"{fit.n_tracks} tracks of commanded and measured pressures, {fit.time_s:.0f} s in all: "
         f"{found.kind}s driven with the commands against the measured pressures. Intervals are 95 %. "
-        f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s).",
+        f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s). {_kept(fit)}",
         (
             ReportTable(("", *titles, "held-out RMS [kPa]"), tuple(rows)),
             ReportTable(("pressures", "RMS [kPa]"), errors),
@@ -191,6 +191,19 @@ def actuators(fit: ActuatorFit) -> Section:
         plain(fit, "spec", "notes") | {"kind": found.kind, "values": as_json(dataclasses.asdict(found))},
         notes=fit.notes,
     )
+
+
+def _kept(fit: ActuatorFit) -> str:
+    """Say why these actuators are kept."""
+    better = f"better by more than {100 * (MARGIN - 1):.0f} % and {SMALL_KPA:g} kPa"
+    if fit.chosen == "regulator":
+        return f"The regulator is kept, since at held-out seconds it is {better}."
+    kept = "pump" if fit.chosen == "pump" else "specification's actuators"
+    text = f"Kept: the {kept}. At held-out seconds nothing else that was fitted is {better}."
+    if fit.held_out_rms_kpa["command"] < fit.held_out_rms_kpa[fit.chosen]:
+        text += " The command itself is closer: the actuators are quicker than this log can show. It is no "
+        text += "actuator, and stands for comparison."
+    return text
 
 
 def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
@@ -254,8 +267,10 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     return Section(
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation settles at the logged lengths, and "
-        f"the network learns the error of its tip. It flags {100 * fit.flagged_share:.1f} % of the held-out "
-        "poses as far from the poses that it learned. "
+        "the network learns the error of its tip. Errors of the sensors' lengths count in full here: these "
+        "simulated tips may be further off than those of Chambers, which stand at measured pressures. "
+        f"The network flags {100 * fit.flagged_share:.1f} % of the held-out poses as far from those that it "
+        "learned. "
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (errors,),
         fit.warnings,
@@ -264,13 +279,15 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     )
 
 
-def with_pressures(section: Section, held: PressureFit, width_kg: np.ndarray, known_kg: float) -> Section:
+def with_pressures(
+    section: Section, held: PressureFit, widths_kg: tuple[float, float], known_kg: float
+) -> Section:
     """Add the residual pressures, before and after their fit, to the network's section.
 
     Args:
         section: section of the network.
         held: fitted residual pressures.
-        width_kg (m,) [kg]: half-widths of a payload's 95 % intervals over the workspace.
+        widths_kg: how well payloads are told, see `calib.fit.payload.told_widths`.
         known_kg: half-width beyond which the control loop does not believe a payload.
     """
     text = (
@@ -280,16 +297,17 @@ def with_pressures(section: Section, held: PressureFit, width_kg: np.ndarray, kn
     )
     figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
     # Tell how well payloads will be known.
-    half_g, most_g = (1e3 * float(np.quantile(width_kg, share)) for share in (0.5, 0.95))
+    none_g, largest_g = (1e3 * kg for kg in widths_kg)
     text += (
-        f" So a payload will be known to {half_g:.0f} g (95 %) at half of the workspace's poses, and to "
-        f"{most_g:.0f} g at 95 % of them."
+        f" So the loop will tell within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
+        f"the workspace's poses, and the largest payload within {largest_g:.0f} g at 95 % of them."
     )
-    data = {"held_pressures_rms_kpa": figures, "payload_half_width_g": {"median": half_g, "p95": most_g}}
+    widths = {"none, median": none_g, "largest, p95": largest_g}
+    data = {"held_pressures_rms_kpa": figures, "payload_half_width_g": widths}
     warnings = section.warnings
-    if most_g > 1e3 * known_kg:
-        remedy = "record the poses of `python -m calib plan`"
-        warnings += (f"payload: known to {most_g:.0f} g, expected {1e3 * known_kg:.0f} g: {remedy}",)
+    if largest_g > 1e3 * known_kg:
+        told = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
+        warnings += (f"{told}: record the poses of `python -m calib plan`",)
     return dataclasses.replace(section, text=section.text + text, warnings=warnings, data=section.data | data)
 
 

@@ -31,6 +31,7 @@ class Rule:
     per: str = ""  # parts that may have a number each, such as "chambers"
     length: int | None = None  # length of a field that must be a list; 0: one number for each part
     why: str = ""  # reason for the lower bound
+    unit: str = ""  # unit, and the one that it is confused with, beside the upper bound
 
     @property
     def text(self) -> str:
@@ -39,6 +40,7 @@ class Rule:
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
         low += f" ({self.why})" if self.why else ""
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
+        high += f" ({self.unit})" if self.unit else ""
         if self.length is not None:
             return f"a list of {self.length} numbers" if self.length else "a list of numbers"
         each = f", or a list with one for each of the {self.per}" if self.per else ""
@@ -58,19 +60,19 @@ class Rule:
         return math.isfinite(value) and above and value <= self.high
 
 
-def positive(per: str = "") -> Any:
-    """Declare a number > 0."""
-    return field(metadata={"rule": Rule(low=0.0, low_open=True, per=per)})
+def positive(per: str = "", high: float = math.inf, unit: str = "") -> Any:
+    """Declare a number > 0, up to a bound that a wrong unit exceeds."""
+    return field(metadata={"rule": Rule(low=0.0, high=high, low_open=True, per=per, unit=unit)})
 
 
-def not_negative(per: str = "") -> Any:
-    """Declare a number >= 0."""
-    return field(metadata={"rule": Rule(low=0.0, per=per)})
+def not_negative(per: str = "", high: float = math.inf, unit: str = "") -> Any:
+    """Declare a number >= 0, up to a bound that a wrong unit exceeds."""
+    return field(metadata={"rule": Rule(low=0.0, high=high, per=per, unit=unit)})
 
 
-def anything(per: str = "", low: float = -math.inf, high: float = math.inf) -> Any:
+def anything(per: str = "", low: float = -math.inf, high: float = math.inf, unit: str = "") -> Any:
     """Declare a number in a range, by default any."""
-    return field(metadata={"rule": Rule(low=low, high=high, per=per)})
+    return field(metadata={"rule": Rule(low=low, high=high, per=per, unit=unit)})
 
 
 def vector() -> Any:
@@ -172,7 +174,9 @@ def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
     items: Any = value if many else [value]
     if rule.length is not None and not (many and len(value) == (rule.length or len(value))):
         raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
-    if not all(map(rule.accepts, items)):
+    if (bad := [k for k, item in enumerate(items) if not rule.accepts(item)]) and many:
+        raise SpecError(f"{source}: {path}[{bad[0]}]: got {items[bad[0]]}, expected {rule.text}")
+    if bad:
         raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
     if rule.kind is float and not all(x == 0.0 or FLOAT32_MIN <= abs(x) <= FLOAT32_MAX for x in items):
         sizes = f"sizes from {FLOAT32_MIN:.2g} to {FLOAT32_MAX:.2g}, which float32 holds"

@@ -29,6 +29,7 @@ from mjx_softarm.deploy.accuracy.measure import (
 from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
 from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.drivers.driven import Arms, finish
+from mjx_softarm.deploy.drivers.names import twin_spec
 from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
 from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
 from mjx_softarm.deploy.link import first_frame
@@ -233,13 +234,19 @@ def _record(
     # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
-    arm_spec = ArmSpec.of(spec)
+    own = twin_spec(on.arm)
+    arm_spec = ArmSpec.of(spec or own)
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
 
     driver = on.open(arm_spec, tell)
     check_number(driver, arm_spec, f"--arm {on.arm}")
+    low, high = arm_spec.chambers.pressure_min_kpa, arm_spec.chambers.pressure_max_kpa
+    default = "" if spec or own else ", by default; --spec names another arm"
+    tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
+    if spec and on.arm.startswith("twin:") and ArmSpec.of(own).geometry != arm_spec.geometry:
+        tell(f"{on.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results
     targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))

@@ -105,6 +105,29 @@ def test_a_calibration_goes_on_with_a_later_log(demo, calibrated, tmp_path, caps
     assert sorted(p.name for p in out.iterdir()) == sorted(p.name for p in before.iterdir())
 
 
+def test_a_later_log_that_shows_no_change_names_no_export(demo, calibrated, tmp_path, capsys):
+    """Five poses are too few to tell a change."""
+    log, later = read_log(demo[1])[0], tmp_path / "later.npz"
+    write_log(later, log.take(np.arange(5)))
+    out = tmp_path / "new"
+    assert main(["run", str(later), "--since", str(calibrated[1]), "--out", str(out)]) == 1
+    said = capsys.readouterr().out
+    assert "next: nothing to export" in said and "train export" not in said
+    assert (out / "arm.toml").read_bytes() == (calibrated[1] / "arm.toml").read_bytes()
+
+
+def test_a_plan_tells_what_the_calibration_told(calibrated, tmp_path, capsys):
+    """The same count of unknown directions, and the same payloads."""
+    parts = json.loads((calibrated[1] / "report.json").read_text())["parts"]
+    n_weak = len(parts["Chambers"]["figures"]["weak"])
+    widths_g = parts["Sim-to-real network"]["figures"]["payload_half_width_g"]
+    assert main(["plan", str(calibrated[1]), "--poses", "8", "--out", str(tmp_path / "next.csv")]) == 0
+    said = capsys.readouterr().out
+    assert f"tells: {n_weak} now" in said
+    for width_g in widths_g.values():
+        assert f"within {width_g:.0f} g now" in said
+
+
 @pytest.mark.parametrize("option", ["--spec", "--shared-springs", "--fit-compensation"])
 def test_options_that_a_later_log_does_not_have_are_refused(option, tmp_path, capsys):
     value = ["paper"] if option == "--spec" else []

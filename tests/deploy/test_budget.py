@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.accuracy.budget import budget
+from mjx_softarm.deploy.accuracy.budget import Budget, budget
 from mjx_softarm.deploy.accuracy.measure import figures, measure, write_accuracy
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
@@ -99,6 +99,21 @@ def test_shifts_of_the_springs_zeros_are_found_as_far_as_eight_goals_tell():
     found = split(Planted(shift_m=SHIFT_M)).shift_mm
     np.testing.assert_allclose(found, 1e3 * SHIFT_M, atol=0.6)
     assert np.corrcoef(found, SHIFT_M)[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("parts_mm", "shift_mm", "strange"),
+    [
+        ({"policy": -2.7, "law": 4.97}, 0.0, True),
+        ({"policy": 0.0, "law": 0.1, "springs": 55.0}, 11.0, True),
+        ({"policy": 0.0, "law": 0.1, "springs": 7.3}, 1.3, False),
+    ],
+)
+def test_an_arm_that_is_hardly_that_of_the_calibration(parts_mm, shift_mm, strange):
+    """Parts that cancel, or zeros that no sensor loses, are of another arm; an aged one is not."""
+    found = Budget(parts_mm, np.full(N, shift_mm), 0.0, 0.0, 0.2, 3, calibrated=True)
+    assert found.strange == strange == ("likely another arm" in found.lines()[1])
+    assert not found._replace(calibrated=False).strange
 
 
 def test_errors_as_at_the_calibration_are_the_models():

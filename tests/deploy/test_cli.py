@@ -13,9 +13,10 @@ import pytest
 from calib.read.logs import read_log
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.drivers.names import Paced, open_arm
+from mjx_softarm.deploy.drivers.names import Paced, open_arm, twin_spec
 from mjx_softarm.logs.pressure_plan import write_plan
 from mjx_softarm.policy.file import SHIPPED, load_policy, save_policy
+from mjx_softarm.spec import ArmSpec
 from tests.linear_arm import DT_S, FAR, POLICY, REST_M, SENSOR, LinearArm, N
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -204,13 +205,46 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
     assert (folder / "a.csv").read_text().count("\n") == 1 + 25
 
 
-def test_a_plan_of_pressures_is_recorded(tmp_path):
+def test_a_plan_of_pressures_is_recorded(tmp_path, capsys):
     plan, out = tmp_path / "next.csv", tmp_path / "log.npz"
     planned_kpa = np.array([[-5.0, 3, -10, -5, 2, 4, 2, -9, -4], [-6.0, 2, -8, -4, 3, 3, 1, -8, -5]])
     write_plan(plan, planned_kpa)
     assert main(["record", "--arm", "twin:rod:101", "--plan", str(plan), "--out", str(out)]) == 0
     found = read_log(out)[0]
     np.testing.assert_allclose(found.pressure_kpa, planned_kpa, atol=0.45)  # the rod's largest deadband
+    said = capsys.readouterr().out
+    assert "arm: paper, 9 chambers, -40 to 20 kPa, by default; --spec names another arm\n" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "spec"),
+    [
+        ("twin:7", None),
+        ("twin:7@my/arm.toml", "my/arm.toml"),
+        ("twin:rod:7@sopra:aged:500g", "sopra"),
+        ("module:Arm", None),
+    ],
+)
+def test_a_twin_names_its_own_arm(name, spec):
+    assert twin_spec(name) == (spec and Path(spec))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["twin:7@wide.toml"], "arm: wide, 9 chambers, -40 to 15 kPa\n"),
+        (["twin:7", "--spec", "wide.toml"], "twin:7 is a twin of another arm than wide.toml, whose"),
+    ],
+)
+def test_record_tells_its_arm_and_a_twin_of_another(words, told, tmp_path, monkeypatch, capsys):
+    chambers, geometry = {"pressure_max_kpa": 15.0}, {"chamber_radius_m": 0.04}
+    ArmSpec.default().replace(name="wide", chambers=chambers, geometry=geometry).to_toml(
+        tmp_path / "wide.toml"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: LinearArm())
+    main(["record", "--arm", *words, "--out", "a.csv", "--poses", "1"])
+    assert told in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

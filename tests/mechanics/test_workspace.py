@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.__main__ import main
+from mjx_softarm.__main__ import _tell_lengths, main
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.workspace import (
@@ -191,7 +191,7 @@ def test_spec_writes_the_default_arm_with_its_sources_and_replaces_nothing(tmp_p
     assert ArmSpec.from_toml(path) == SPEC
 
 
-def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatch):
+def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatch, capsys):
     SMALL.to_toml(tmp_path / "small.toml")
     code, printed, complaint = run("workspace", "--spec", tmp_path / "small.toml", "--out", tmp_path / "new")
     assert (code, complaint) == (0, "")
@@ -199,9 +199,18 @@ def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatc
     lateral, vertical = coverage_mm(extreme_poses(SMALL))
     assert f"lateral (y)   {lateral:6.1f} mm\n" in printed
     assert f"vertical (z)  {vertical:6.1f} mm\n" in printed
+    reached_mm = [1e3 * f(extreme_poses(SMALL).spring_m) for f in (np.min, np.max)]
+    asked = "springs.length_min_m and length_max_m: 85 to 275 mm"
+    assert "springs: {:.0f} to {:.0f} mm; {}\n".format(*reached_mm, asked) in printed
     image = matplotlib.image.imread(tmp_path / "new" / "workspace.png")
     crimson = np.abs(image[..., :3] - [0.863, 0.078, 0.235]).max(-1) < 0.05
     assert image.shape[1] > image.shape[0] > 600 and crimson.sum() > 500  # the boundary is there
+
+    # Limits that are far from what the springs reach are told.
+    far = SMALL.replace(springs={"length_max_m": 0.35})
+    _tell_lengths(far, np.array([[0.1, 0.2, 0.26]]))
+    asked = "length_max_m: 85 to 350 mm, expected about what they reach"
+    assert f"springs: 100 to 260 mm; springs.length_min_m and {asked}" in capsys.readouterr().out
 
     # The paper's numbers stand beside its own arm alone, here at fewer pressures.
     few = random_pressures(SPEC, 32, seed=0)
@@ -222,6 +231,17 @@ def test_picture_draws_the_arm_at_its_pressures(tmp_path):
     x, y, z = 1e3 * settle_many(SMALL, np.array([pressures])).tip_position_m[0]
     assert f"tip at x {x:.1f}, y {y:.1f}, z {z:.1f} mm" in printed
     assert np.ptp(matplotlib.image.imread(tmp_path / "arm.png"), axis=(0, 1)).max() > 0.5
+
+
+def test_an_arm_that_does_not_settle_by_itself_is_told_by_its_file(tmp_path):
+    """A stiffness in N/mm instead of N/m; no pressure is to blame."""
+    soft = {"mass": {"gripper_kg": 45.0}, "chambers": {"stiffness_n_per_m": 0.5}}
+    SMALL.replace(backbone={"axial_stiffness_n_per_m": 0.8}, **soft).to_toml(tmp_path / "soft.toml")
+    code, _, complaint = run("picture", "--spec", tmp_path / "soft.toml", "--out", tmp_path / "arm.png")
+    if "expected OpenGL" in complaint:
+        pytest.skip(complaint)
+    assert code == 2 and complaint.startswith(f"error: {tmp_path / 'soft.toml'}: got an arm that does not")
+    assert complaint.endswith("check the units of its masses, lengths and stiffnesses\n")
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,12 @@ def open_arm(name: str) -> Any:
         raise InputError(f"--arm {name}: got {got}; expected an arm that opens") from error
 
 
+def twin_spec(name: str) -> Path | None:
+    """Return the arm, as for `--spec`, that a twin's name has after its @; None if it names none."""
+    arm = name.partition("@")[2].partition(":")[0]
+    return Path(arm) if name.startswith("twin:") and arm else None
+
+
 class Paced:
     """A simulated arm that is no faster than a real one."""
 

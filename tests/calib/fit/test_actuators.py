@@ -8,6 +8,7 @@ import pytest
 from calib.fit.motion.actuators import fit_actuators, with_actuators
 from calib.fit.motion.tracks import find_tracks
 from calib.read.measurements import measure
+from calib.report import sections
 from calib.steps import actuators
 from mjx_softarm.deploy.record import record
 from mjx_softarm.logs.schema import Log
@@ -101,6 +102,10 @@ def test_the_specification_s_pump_stays_where_it_fits(short):
     fit = fit_actuators(find_tracks([log_of(short, short.actuators)], short), short)
     assert fit.chosen == "specification" and fit.spec == short
     assert fit.held_out_rms_kpa["specification"] < 0.5 < fit.held_out_rms_kpa["command"]
+    assert "Kept: the specification's actuators" in sections.actuators(fit).text
+    closer = dict(fit.held_out_rms_kpa, command=0.0)
+    quick = sections.actuators(dataclasses.replace(fit, held_out_rms_kpa=closer)).text
+    assert "The command itself is closer" in quick
 
 
 def test_a_weaker_pump_is_found(short):
@@ -119,7 +124,8 @@ def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
     for name, tolerance in (("lag_s", 0.12), ("dead_time_s", 0.03)):
         np.testing.assert_allclose(getattr(fit.spec.actuators, name), getattr(true, name), atol=tolerance)
     assert not fit.warnings and "fill_kpa_per_s is known to" in fit.notes[0]
-    assert actuators(measure([log], spec), spec, 0).section.notes == fit.notes
+    section = actuators(measure([log], spec), spec, 0).section
+    assert section.notes == fit.notes and "The regulator is kept" in section.text
 
 
 def test_a_log_without_commands_or_of_poses_alone_says_so(short):

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.report.page import ReportTable, Section, to_html, to_json
+from calib.report.page import ReportTable, Section, to_html, to_json, warning_lines
 
 PROVENANCE = {"commit": "0123abc", "packages": {"numpy": "2.0"}}
 
@@ -52,6 +52,16 @@ def test_page_shows_every_part_with_its_figures_and_needs_no_other_file():
     assert [image[:22] for image in page.images] == ["data:image/png;base64,"]
     assert "No fault was found in them." in page.texts["p"]
     assert "commit: 0123abc" in page.texts["pre"][0]
+
+
+def test_warnings_with_one_remedy_are_a_line_with_their_count():
+    """Details of a warning, in its further lines, stand in the page alone."""
+    few = tuple(f"spring{k}: got 20 rows, expected 50 or more: measure more" for k in range(9))
+    parts = make_parts((*few, "2 unknown directions: record poses\n  known to 1.5 times the tolerance"))
+    assert warning_lines(parts) == [
+        "warning: Springs: spring0: got 20 rows, expected 50 or more, and 8 more: measure more",
+        "warning: Springs: 2 unknown directions: record poses",
+    ]
 
 
 def test_verdict_names_the_parts_with_warnings():
