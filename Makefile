@@ -17,7 +17,7 @@ help:  ## this list
 demo: $(INSTALLED)  ## train a small policy, show its figures, draw its pictures, play it on a simulated arm
 	$(BIN)/python -m train reach --preset quick
 	@run=$$(ls -dt runs/reach-quick-seed0* | head -1); $(BIN)/python -m train export "$$run" && \
-	{ $(BIN)/python -m mjx_softarm.deploy measure "$$run/policy.npz" --arm twin:0 --points 40 --seconds 20 \
+	{ $(BIN)/python -m mjx_softarm.deploy measure "$$run/policy.npz" --arm twin:0:exact --points 40 --seconds 20 \
 	  --out "$$run/twin" || [ $$? -eq 1 ]; } && \
 	$(BIN)/python -m mjx_softarm.view "$$run/twin/log.npz" --html "$$run/twin.html"
 

@@ -7,16 +7,18 @@ from pathlib import Path
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.arm import Twin
-from mjx_softarm.twin.instruments import AGED, AS_BUILT
+from mjx_softarm.twin.instruments import AGED, AS_BUILT, EXACT
 from mjx_softarm.twin.rod_twin import RodTwin
 
-ROD, _AGED = "rod", ":aged"
+ROD = "rod"
+_BUILDS = {":aged": AGED, ":exact": EXACT}
 
 
 def twin_of(name: str) -> Twin | RodTwin:
-    """Make the twin of a name: `SEED` or `rod:SEED`, maybe with `@ARM`, `:PIPE`, `:aged`, `:lost4`, `:500g`.
+    """Make the twin of a name: `SEED` or `rod:SEED`, maybe with more.
 
-    The arm is named as for `--spec`, by default the paper's. A payload is given in grams. Rods have no pipe.
+    More is, in this order, `@ARM`, `:PIPE`, `:aged` or `:exact`, `:lost4`, `:500g`. The arm is named as for
+    `--spec`, by default the paper's. A payload is given in grams. Rods have no pipe.
 
     Raises:
         ValueError: the name is malformed, the arm is unknown, or the arm does not fit into the pipe.
@@ -24,8 +26,9 @@ def twin_of(name: str) -> Twin | RodTwin:
     name, payload_kg = _without_payload(name)
     rest, _, last = name.rpartition(":lost")
     name, lost = (rest, int(last)) if rest and last.isdecimal() else (name, None)
-    build = (AGED if name.endswith(_AGED) else AS_BUILT)._replace(lost=lost)
-    name = name.removesuffix(_AGED)
+    suffix = next(filter(name.endswith, _BUILDS), "")
+    build = _BUILDS.get(suffix, AS_BUILT)._replace(lost=lost)
+    name = name.removesuffix(suffix)
     if name.startswith(f"{ROD}:"):
         number, spec = _seed_and_arm(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED")
         return RodTwin(number, spec, payload_kg, build=build)

@@ -259,6 +259,16 @@ def test_losses_of_a_small_arm_are_small():
 
 
 @pytest.mark.parametrize("kind", ["", "rod:"])
+def test_an_exact_twin_has_the_specified_parts(kind):
+    """Without noise, springs read the same in all of them, as those of the specification do."""
+    lengths_m = [open_arm(f"twin:{kind}{seed}:exact")._lengths_m() for seed in (1, 2)]
+    np.testing.assert_allclose(*lengths_m, atol=1e-9)
+    sensor, specified = open_arm(f"twin:{kind}1:exact")._sensor, ArmSpec.default().spring_sensor
+    np.testing.assert_array_equal(sensor.beta, specified.beta)
+    np.testing.assert_array_equal(sensor.delta_m, specified.delta_m)
+
+
+@pytest.mark.parametrize("kind", ["", "rod:"])
 def test_an_aged_twin_is_the_same_arm_with_shifted_zeros_and_softer_chambers(kind):
     """The shift alone shows at no pressure; the load on softer chambers lengthens the springs a little."""
     young, aged = (open_arm(f"twin:{kind}3{age}") for age in ("", ":aged"))
