@@ -267,8 +267,8 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     return Section(
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation settles at the logged lengths, and "
-        "the network learns the error of its tip. Errors of the sensors' lengths count in full here: these "
-        "simulated tips may be further off than those of Chambers, which stand at measured pressures. "
+        "the network learns the error of its tip. The arm of Chambers has the measured pressures instead and "
+        "spring lengths that are off by some millimetres. So simulated tips may be further off here. "
         f"The network flags {100 * fit.flagged_share:.1f} % of the held-out poses as far from those that it "
         "learned. "
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
