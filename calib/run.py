@@ -87,7 +87,7 @@ def calibrate(
     recorded = None
     if "scale" in extras and "error_mm" in extras:
         poses = measurements.poses
-        known = (extras[name] for name in ("error_mm", "scale", "covariance"))
+        known = extras["error_mm"], extras["scale"], extras.get("covariance")
         recorded = Recorded(poses.pressure_kpa, poses.payload_kg, *known)
     return Calibration(
         spec, tuple(report), extras.get("s2r"), extras.get("held"), recorded, extras.get("pairs", {})
