@@ -74,7 +74,7 @@ def guarded(run: Callable[[], int]) -> int:
     except SystemExit as stop:
         if stop.code is None or isinstance(stop.code, int):  # tyro has printed help, or which option is wrong
             return stop.code or 0
-        text = stop.code  # of a program that ends itself with a message, such as a user's driver
+        text = stop.code  # message of a program that ends itself, such as a user's driver
     except InputError as error:
         text = str(error)
     except OSError as error:

@@ -28,7 +28,7 @@ def product(a: Array, b: Array) -> Array:
     return jnp.sum(a[:, :, None] * b, axis=1)
 
 
-products = jax.vmap(product)  # of matrices (k, n, m, *arms) and (k, m, l, *arms)
+products = jax.vmap(product)  # multiplies matrices (k, n, m, *arms) and (k, m, l, *arms)
 
 
 def identity(n: int, like: Array) -> Array:

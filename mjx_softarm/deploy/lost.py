@@ -19,7 +19,7 @@ from mjx_softarm.deploy.strategy import strategy_of
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import N_STEPS, begin, best_of, improve, nearest_of, springs_of
 
-MORE_STEPS = 3  # of a search that goes on from a goal to the same goal with a shift
+MORE_STEPS = 3  # steps of a search that goes on from a goal to the same goal with a shift
 
 
 class GoalSearch:

@@ -103,7 +103,7 @@ class _Hold:
         """Take the row of a tick; `seen` is False where motion capture missed the tip."""
         self.ticks.append(row)
         if not seen or not all(np.isfinite(row[name]).all() for name in NEEDED if name in row):
-            return  # as calibration does
+            return  # calibration leaves out such rows, too
         if self.rows and leaves(row["pressure_kpa"], self.rows[0]["pressure_kpa"]):
             self.rows.clear()
         self.rows.append(row)

@@ -126,7 +126,7 @@ class Predicting(NamedTuple):
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
     lengths_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
-    shape: ShapeLag = ShapeLag()  # of an arm with these lengths
+    shape: ShapeLag = ShapeLag()  # memory of an arm with these lengths
     behind: np.ndarray | float = 0.0  # (6,) [mm, deg] pose at rest with the last lengths less that in motion
     way: WayError = WayError()
 

@@ -66,6 +66,7 @@ def _read_npz(path: Path) -> Table:
 
 
 def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
+    # Header: the first line names the columns, unless `names` does.
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     _check_text(path, head)

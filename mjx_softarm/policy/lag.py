@@ -95,7 +95,7 @@ class WayError(NamedTuple):
     """
 
     goals: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] of each tick, from the one two ticks ago to the lead
-    correction_mm: np.ndarray = np.zeros(3)  # of the goal now
+    correction_mm: np.ndarray = np.zeros(3)  # correction of the goal now
 
     def after(self, goal: np.ndarray, pose: np.ndarray, rule: WayRule) -> WayError:
         """Return the memory a tick later, for a goal ahead (6,) and a believed pose now (6,) [mm, deg]."""

@@ -26,7 +26,7 @@ from mjx_softarm.sensing.pose import (
     share_of_turn,
 )
 
-N_CHANGES = 6  # of a section's end: position [m], Gibbs vector (axis times the tangent of half the angle)
+N_CHANGES = 6  # change of a section's end: position [m], Gibbs vector (axis times tangent of half the angle)
 _SMALL_BEND = 1e-8  # square of a bend [rad^2] below which a section counts as straight
 
 
@@ -125,10 +125,8 @@ def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
 
     # Chord and turn of the arc
     half = xp.sin(0.5 * angle) / angle
-    aside, down = (
-        2.0 * half**2,
-        xp.sin(angle) / angle,
-    )  # aside: (1 - cos) / angle^2, exact in float32
+    aside = 2.0 * half**2  # (1 - cos) / angle^2, exact in float32
+    down = xp.sin(angle) / angle
     position_m = length * xp.concat([aside * bend, -down], axis=-1)
     across = half * bend  # the axis of the turn is (bend y, -bend x, 0)
     quaternion = xp.concat(
@@ -188,7 +186,7 @@ def backbone(
 
     # Spread the distance of the tip from their end
     tip_m, tip_rotation = frame_from_pose(np.asarray(tip, float))
-    share = (np.arange(len(frames))[:, None] + at) / len(frames)  # of the way to the tip
+    share = (np.arange(len(frames))[:, None] + at) / len(frames)  # share of the way to the tip
     turn = share_of_turn(tip_rotation @ above.T, share)
     return Frame(position_m + share[..., None] * (tip_m - above_m), turn @ rotation)
 

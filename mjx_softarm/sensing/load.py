@@ -30,7 +30,7 @@ class LoadEstimator(NamedTuple):
     """Network from springs and pressures at rest to the payload. All float32."""
 
     layers: tuple[Layer, ...]  # normalised springs and pressures -> normalised payload (1,)
-    sd_layers: tuple[Layer, ...]  # the same inputs -> logarithm of its standard deviation (1,)
+    sd_layers: tuple[Layer, ...]  # inputs of `layers` -> logarithm of the standard deviation (1,)
     spring_centre_m: Array  # (n_springs,)
     spring_scale_m: Array  # (n_springs,)
     pressure_centre_kpa: Array  # (n_chambers,)

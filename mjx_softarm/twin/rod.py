@@ -199,7 +199,7 @@ class Rod:
         stiffness, skew, hardening, rest, area, area_slope = self._chamber_law
         spring_stiffness, spring_rest = self._spring_law
         kpa = np.repeat(pressure_kpa, self.per_section, axis=0)
-        kpa = kpa * (1.0 + self._growth * kpa)  # as if the area were constant
+        kpa = kpa * (1.0 + self._growth * kpa)  # pressure of the same force on a constant area
 
         # Chambers, then springs
         off = chamber - rest

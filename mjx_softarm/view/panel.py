@@ -74,7 +74,7 @@ def bars(look: Look, limits: Limits) -> str:
     """Return bars of pressures between their limits, and of springs beside their references, as HTML."""
     saturated, zero = limits.saturated(look), np.zeros(len(look.pressure_kpa))
     low_kpa, high_kpa = zero + limits.gains.pressure_min_kpa, zero + limits.gains.pressure_max_kpa
-    beside = saturated[:: len(saturated) // len(look.spring_m)]  # of the chambers with a spring beside them
+    beside = saturated[:: len(saturated) // len(look.spring_m)]  # chambers that have a spring beside them
     springs = limits.spring_m[0], look.spring_m, look.reference_m
     # Words below the bars, and a note about saturated chambers.
     kpa = [f"{p:.0f}" for p in look.pressure_kpa]

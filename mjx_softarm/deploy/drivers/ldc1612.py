@@ -19,7 +19,7 @@ import numpy as np
 
 from mjx_softarm._support.errors import needing
 
-DATA_MSB, RCOUNT, SETTLECOUNT, CLOCK_DIVIDERS, DRIVE_CURRENT = 0x00, 0x08, 0x10, 0x14, 0x1E  # of channel 0
+DATA_MSB, RCOUNT, SETTLECOUNT, CLOCK_DIVIDERS, DRIVE_CURRENT = 0x00, 0x08, 0x10, 0x14, 0x1E  # channel 0
 STATUS, ERROR_CONFIG, CONFIG, MUX_CONFIG, RESET_DEV = 0x18, 0x19, 0x1A, 0x1B, 0x1C
 IDS = {0x7E: 0x5449, 0x7F: 0x3055}  # manufacturer and device, by register
 CLOCK_HZ = 40e6  # external clock
@@ -27,8 +27,8 @@ CLOCK_HZ = 40e6  # external clock
 # 35 MHz at most, with several channels 40 MHz; a coil's clock has to be below a quarter of the reference
 # (SNOSCY9, "Clocking Architecture"). The reading is their ratio, which stays as it is.
 DIVIDER_OF_ONE = 2
-CONVERSION_S = 0.004  # of one channel; by hand: a converter's two channels end twice within a tick
-SETTLE_S = 2e-5  # of a coil before its conversion; by hand: a Q factor of 40 at 2 MHz
+CONVERSION_S = 0.004  # duration for one channel; by hand: two channels end twice within a tick
+SETTLE_S = 2e-5  # wait for a coil before its conversion; by hand: a Q factor of 40 at 2 MHz
 BUS_TIMEOUT = 1  # longest transfer, in steps of 10 ms
 I2C_TIMEOUT = 0x0702  # ioctl of Linux's i2c-dev
 
