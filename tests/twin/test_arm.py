@@ -140,7 +140,7 @@ def test_closed_loop_in_pressure_dissipates():
     """Work of the air over a closed loop: little in a nearly undamped arm, much with losses."""
     work_j = []
     for losses in (0.0, 1.0):
-        arm = Twin(1, build=Build(losses=losses))
+        arm = Twin(1, build=Build(losses=losses, per_section=4))
         arm._model.tendon_damping[:] *= 0.05
         arm._model.dof_damping[:] *= 0.05
         work_of_pressures(arm, 300)
@@ -203,7 +203,7 @@ def test_springs_reach_their_references_from_any_side(spec):
     """The law at 50 Hz; what hysteresis leaves at the tip once the springs are where they should be."""
     gains, tips_m = Gains.from_spec(spec), []
     reference_m = settle_many(spec, 0.5 * PRESSURES_KPA[1:2]).spring_m[0].astype(float)
-    arm = Twin(2)
+    arm = Twin(2, build=Build(per_section=5))
     for start_kpa in (-14.0, 4.0):
         hold_pressures(arm, np.full(9, start_kpa), 3.0)
         hold_springs(arm, reference_m, np.full(9, start_kpa), gains, 9.0, arm._parts.sensor)
