@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_softarm.control import Gains, LawState
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.lag import WayRule, spring_lag_s
+from mjx_softarm.policy.lag import spring_lag_s
 from mjx_softarm.policy.reachable import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.spec import ArmSpec
@@ -119,14 +119,6 @@ class Controller:
             observes_payload=policy.observation == "payload",
             lead_s=lead_s,
             config=config,
-        )
-
-    @property
-    def way_rule(self) -> WayRule:
-        """Numbers by which `WayError` corrects a moving goal."""
-        config = self.config
-        return WayRule(
-            self.policy.reward, self.dt_s, self.lead_s, config.way_share_per_s, config.max_shift[0]
         )
 
 

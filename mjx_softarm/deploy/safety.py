@@ -41,6 +41,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm.control import allocated_error
 from mjx_softarm.deploy.belief import Belief
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.sensing.load import HIGHEST, LOWEST
@@ -182,6 +183,34 @@ def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> Iterato
     if load.kg - load.half_width_kg > config.overload * most_kg:
         told = f"{1e3 * load.kg:.0f} +- {1e3 * load.half_width_kg:.0f} g"
         yield Event(Fault.OVERLOADED, f"{told}, expected at most {1e3 * most_kg:.0f} g")
+
+
+def extrapolated(belief: Belief) -> tuple[Event, ...]:
+    """Return the fault of a pose far from the training rows of the sim-to-real network, before an action."""
+    if not belief.away > 1.0:
+        return ()
+    text = f"{belief.away:.1f} times as far from the training rows as the network is believed"
+    return (Event(Fault.EXTRAPOLATION, text),)
+
+
+def unsettled(belief: Belief) -> tuple[Event, ...]:
+    """Return the faults of the springs as they stand before the next action."""
+    # Errors at the chambers: springs of an arm with redundant chambers cannot all be on any references
+    controller, command, mask, events = belief.controller, belief.command, belief.saturated, []
+    off_m, allocation = belief.mean_m - command.reference_m, controller.policy.gains.allocation
+    if allocation is not None:
+        off_m = -allocated_error(-off_m, command.pressure_kpa, allocation)
+
+    if not belief.settled:
+        worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
+        where = f"{'spring' if allocation is None else 'chamber'}{worst}"
+        text = f"after {controller.config.settle_timeout_s:g} s, {where} is {1e3 * off_m[worst]:+.1f} mm"
+        events.append(Event(Fault.NOT_SETTLED, f"{text} off its reference"))
+    if mask.any():
+        off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
+        text = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
+        events.append(Event(Fault.SATURATED, text))
+    return tuple(events)
 
 
 def names(kind: str, mask: np.ndarray) -> str:

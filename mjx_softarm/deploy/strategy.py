@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.control import allocated_error
 from mjx_softarm.deploy.belief import Belief, pose_of
-from mjx_softarm.deploy.safety import Event, Fault, names
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.safety import Event, extrapolated, unsettled
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import asked_error, weighted_error
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.lag import ShapeLag, WayError, spring_lag_s
+from mjx_softarm.policy.lag import ShapeLag, spring_lag_s
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.load import Load
@@ -66,7 +66,7 @@ class AtRest(NamedTuple):
             allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
 
         # The next action, or the arrival after the last one.
-        events = _unsettled(belief)
+        events = unsettled(belief)
         if self.n_actions == policy.n_actions:
             return _arrive(self, belief, shifts[0], events)
         return self._act(belief, goal, shifts, events, allowed)
@@ -80,7 +80,7 @@ class AtRest(NamedTuple):
         allowed: float | None = None,
     ) -> Choice:
         """Take the first shift whose references leave a weighted error of at most `allowed`, if given."""
-        events += _extrapolated(belief)
+        events += extrapolated(belief)
         for shift in shifts:
             reference_m = _planned(belief, belief.pose, goal + shift)
             if allowed is not None:
@@ -109,10 +109,43 @@ class Timed(NamedTuple):
             if belief.settled:
                 shift = _clipped(shift - _left(self, belief, goal)[1], config.shift_limit)
             if is_last:
-                return _arrive(self, belief, shift, _unsettled(belief))
+                return _arrive(self, belief, shift, unsettled(belief))
         reference_m = _planned(belief, belief.pose, goal + shift)
         after = Timed(shift, self.n_actions + 1, belief.load)
-        return Choice(after, reference_m, _extrapolated(belief))
+        return Choice(after, reference_m, extrapolated(belief))
+
+
+class WayError(NamedTuple):
+    """Memory of the tip's errors behind a moving goal, and the correction of the goal.
+
+    The correction integrates the believed errors. It turns with the direction of the way: relative to it,
+    errors along the way, such as a lag, and across it stay nearly constant on a bend.
+    """
+
+    goals: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] of each tick, from the one two ticks ago to the lead
+    correction_mm: np.ndarray = np.zeros(3)  # correction of the goal now
+
+    def after(self, goal: np.ndarray, pose: np.ndarray, controller: Controller) -> WayError:
+        """Return the memory a tick later, for a goal ahead (6,) and a believed pose now (6,) [mm, deg]."""
+        # Wait until the goals reach back to the present one.
+        dt_s, lead_s, config = controller.dt_s, controller.lead_s, controller.config
+        goals = (*self.goals, goal)[-round(lead_s / dt_s) - 3 :]
+        if dt_s * (len(goals) - 3) < lead_s - 0.5 * dt_s:
+            return WayError(goals)
+        # Turn the correction with the way, and integrate the error.
+        before, last, now = goals[:3]
+        kept_mm = _turned(self.correction_mm, (last - before)[:3], (now - last)[:3])
+        error_mm = asked_error(pose, now, controller.policy.reward)[:3]
+        correction_mm = kept_mm - config.way_share_per_s * dt_s * error_mm
+        return WayError(goals, np.clip(correction_mm, -config.max_shift[0], config.max_shift[0]))
+
+    @property
+    def correction(self) -> np.ndarray:
+        """Correction (6,) [mm, deg] of the goal ahead."""
+        if len(self.goals) < 4:
+            return np.zeros(6)
+        steps = (self.goals[2] - self.goals[1])[:3], (self.goals[-1] - self.goals[-2])[:3]
+        return np.append(_turned(self.correction_mm, *steps), np.zeros(3))
 
 
 class Predicting(NamedTuple):
@@ -135,7 +168,7 @@ class Predicting(NamedTuple):
         # Lengths at the goal, of an arm whose shape lags and that has been beside its way
         controller, policy, pose = belief.controller, belief.controller.policy, belief.pose
         shift, length_m = self.shift, belief.spring_m
-        way = self.way.after(goal, pose - self.behind, controller.way_rule)
+        way = self.way.after(goal, pose - self.behind, controller)
         goal = goal + self.behind + way.correction
         for _ in range(policy.n_actions):
             length_m = _planned(belief, pose, goal + shift)
@@ -168,7 +201,7 @@ class Chasing(NamedTuple):
         controller, policy = belief.controller, belief.controller.policy
         shape = self.shape.after(policy, belief.spring_m, belief.pose, controller.dt_s)
         pose = belief.pose - shape.behind(policy, belief.spring_m, belief.pose)
-        after = self._replace(shape=shape, way=self.way.after(goal, pose, controller.way_rule))
+        after = self._replace(shape=shape, way=self.way.after(goal, pose, controller))
         # The action that is due
         waited_s = belief.command.n_ticks * controller.dt_s
         if belief.command.reference_m is not None and waited_s < policy.action_s:
@@ -237,28 +270,14 @@ def _clipped(shift: np.ndarray, limit: np.ndarray) -> np.ndarray:
     return np.clip(shift, -limit, limit)
 
 
-def _extrapolated(belief: Belief) -> tuple[Event, ...]:
-    if not belief.away > 1.0:
-        return ()
-    text = f"{belief.away:.1f} times as far from the training rows as the network is believed"
-    return (Event(Fault.EXTRAPOLATION, text),)
-
-
-def _unsettled(belief: Belief) -> tuple[Event, ...]:
-    """Return the faults of the springs as they stand before the next action."""
-    # Errors at the chambers: springs of an arm with redundant chambers cannot all be on any references
-    controller, command, mask, events = belief.controller, belief.command, belief.saturated, []
-    off_m, allocation = belief.mean_m - command.reference_m, controller.policy.gains.allocation
-    if allocation is not None:
-        off_m = -allocated_error(-off_m, command.pressure_kpa, allocation)
-
-    if not belief.settled:
-        worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
-        where = f"{'spring' if allocation is None else 'chamber'}{worst}"
-        text = f"after {controller.config.settle_timeout_s:g} s, {where} is {1e3 * off_m[worst]:+.1f} mm"
-        events.append(Event(Fault.NOT_SETTLED, f"{text} off its reference"))
-    if mask.any():
-        off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
-        text = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
-        events.append(Event(Fault.SATURATED, text))
-    return tuple(events)
+def _turned(vector: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return a vector (3,) turned as the direction `before` (3,) has to turn to become `after` (3,)."""
+    lengths = np.linalg.norm(before), np.linalg.norm(after)
+    if min(lengths) < 1e-9:
+        return vector
+    a, b = before / lengths[0], after / lengths[1]
+    if a @ b < -0.9:  # back again: about any axis
+        return -vector
+    turn = np.cross(a, b)
+    across = np.cross(turn, vector)
+    return vector + across + np.cross(turn, across) / (1.0 + a @ b)

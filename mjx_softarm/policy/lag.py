@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.control import Gains
-from mjx_softarm.mdp.rewards import RewardConfig, asked_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import Frame, even_pose, expected_springs
 from mjx_softarm.sensing.pose import pose_error
@@ -75,56 +74,3 @@ class ShapeLag(NamedTuple):
         own = policy.estimator
         base = Frame(own.base_position_m, own.base_rotation)
         return pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
-
-
-class WayRule(NamedTuple):
-    """Numbers by which `WayError` corrects the goal."""
-
-    reward: RewardConfig  # its weights say which axes a goal asks for
-    dt_s: float  # duration of a tick
-    lead_s: float  # time by which the goal is given ahead of its time
-    share_per_s: float  # share of the error that the correction takes up in a second
-    limit_mm: float  # largest correction of an axis
-
-
-class WayError(NamedTuple):
-    """Memory of the tip's errors behind a moving goal, and the correction of the goal.
-
-    The correction integrates the believed errors. It turns with the direction of the way, in which errors
-    along the way, such as a lag, and across it stay nearly constant on a bend.
-    """
-
-    goals: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] of each tick, from the one two ticks ago to the lead
-    correction_mm: np.ndarray = np.zeros(3)  # correction of the goal now
-
-    def after(self, goal: np.ndarray, pose: np.ndarray, rule: WayRule) -> WayError:
-        """Return the memory a tick later, for a goal ahead (6,) and a believed pose now (6,) [mm, deg]."""
-        goals = (*self.goals, goal)[-round(rule.lead_s / rule.dt_s) - 3 :]
-        if rule.dt_s * (len(goals) - 3) < rule.lead_s - 0.5 * rule.dt_s:
-            return WayError(goals)
-        before, last, now = goals[:3]
-        kept_mm = _turned(self.correction_mm, (last - before)[:3], (now - last)[:3])
-        error_mm = asked_error(pose, now, rule.reward)[:3]
-        correction_mm = kept_mm - rule.share_per_s * rule.dt_s * error_mm
-        return WayError(goals, np.clip(correction_mm, -rule.limit_mm, rule.limit_mm))
-
-    @property
-    def correction(self) -> np.ndarray:
-        """Correction (6,) [mm, deg] of the goal ahead."""
-        if len(self.goals) < 4:
-            return np.zeros(6)
-        steps = (self.goals[2] - self.goals[1])[:3], (self.goals[-1] - self.goals[-2])[:3]
-        return np.append(_turned(self.correction_mm, *steps), np.zeros(3))
-
-
-def _turned(vector: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return a vector (3,) turned as the direction `before` (3,) has to turn to become `after` (3,)."""
-    lengths = np.linalg.norm(before), np.linalg.norm(after)
-    if min(lengths) < 1e-9:
-        return vector
-    a, b = before / lengths[0], after / lengths[1]
-    if a @ b < -0.9:  # back again: about any axis
-        return -vector
-    turn = np.cross(a, b)
-    across = np.cross(turn, vector)
-    return vector + across + np.cross(turn, across) / (1.0 + a @ b)

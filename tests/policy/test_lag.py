@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from mjx_softarm.policy.lag import ShapeLag, WayError, spring_lag_s
+from mjx_softarm.deploy.strategy import WayError
+from mjx_softarm.policy.lag import ShapeLag, spring_lag_s
 from mjx_softarm.sensing.estimator import Frame, even_pose
 from tests.linear_arm import CONTROLLER, DT_S, GAIN_M_PER_KPA, POLICY, SPEC, SPRINGS_M, N
 
@@ -42,7 +43,7 @@ def test_an_error_that_stays_beside_a_round_way_is_made_up_for():
         late = corrected[-n_lead] if len(corrected) >= n_lead else np.zeros(6)  # the correction is in force
         outward, along, up = axes(k)
         off_mm = 3.0 * outward - 4.0 * along + 2.0 * up
-        way = way.after(ahead, now + np.append(off_mm, np.zeros(3)) + late, CONTROLLER.way_rule)
+        way = way.after(ahead, now + np.append(off_mm, np.zeros(3)) + late, CONTROLLER)
         corrected.append(way.correction)
     assert np.linalg.norm(off_mm + late[:3]) < 0.02 * np.linalg.norm(off_mm)
     assert not corrected[n_lead].any() and not way.correction[3:].any()
