@@ -180,7 +180,7 @@ class Entries:
         return tuple(layers)
 
     def network(
-        self, name: str, kind: type, widths: Mapping[str, tuple[int, int]], shapes: Mapping[str, tuple]
+        self, name: str, kind: type, widths: Mapping[str, tuple[int, int]], **shapes: tuple[int | None, ...]
     ) -> Any:
         """Return a named tuple of networks and of float32 arrays, as `entries_of` stored it.
 

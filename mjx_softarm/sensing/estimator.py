@@ -206,12 +206,19 @@ def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int)
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
     n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
-    shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
-    shapes |= dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
-    shapes |= {"spring_site_m": (n_sections, n_springs // n_sections, 2), "change_scale": (N_CHANGES,)}
-    shapes |= {"base_position_m": (3,), "base_rotation": (3, 3)}
-    widths = {"load_layers": (n_in + 1, n_out), "layers": (n_in, n_out)}
-    return entries.network(name, PoseEstimator, widths, shapes)
+    return entries.network(
+        name,
+        PoseEstimator,
+        {"load_layers": (n_in + 1, n_out), "layers": (n_in, n_out)},
+        spring_site_m=(n_sections, n_springs // n_sections, 2),
+        spring_centre_m=(n_springs,),
+        spring_scale_m=(n_springs,),
+        load_centre_kg=(),
+        load_scale_kg=(),
+        change_scale=(N_CHANGES,),
+        base_position_m=(3,),
+        base_rotation=(3, 3),
+    )
 
 
 def take_spring_model(entries: Entries, name: str, n_chambers: int, n_springs: int) -> SpringModel:
@@ -220,6 +227,12 @@ def take_spring_model(entries: Entries, name: str, n_chambers: int, n_springs: i
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    shapes = dict.fromkeys(("pressure_centre_kpa", "pressure_scale_kpa"), (n_chambers,))
-    shapes |= dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
-    return entries.network(name, SpringModel, {"layers": (n_chambers, n_springs)}, shapes)
+    return entries.network(
+        name,
+        SpringModel,
+        {"layers": (n_chambers, n_springs)},
+        pressure_centre_kpa=(n_chambers,),
+        pressure_scale_kpa=(n_chambers,),
+        spring_centre_m=(n_springs,),
+        spring_scale_m=(n_springs,),
+    )

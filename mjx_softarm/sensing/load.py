@@ -98,8 +98,14 @@ def take_load_estimator(entries: Entries, name: str, n_chambers: int, n_springs:
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
-    shapes |= dict.fromkeys(("pressure_centre_kpa", "pressure_scale_kpa"), (n_chambers,))
-    shapes["load_scale_kg"] = ()
-    widths = dict.fromkeys(("sd_layers", "layers"), (n_springs + n_chambers, 1))
-    return entries.network(name, LoadEstimator, widths, shapes)
+    n_in = n_springs + n_chambers
+    return entries.network(
+        name,
+        LoadEstimator,
+        {"sd_layers": (n_in, 1), "layers": (n_in, 1)},
+        spring_centre_m=(n_springs,),
+        spring_scale_m=(n_springs,),
+        pressure_centre_kpa=(n_chambers,),
+        pressure_scale_kpa=(n_chambers,),
+        load_scale_kg=(),
+    )

@@ -173,10 +173,18 @@ def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
     n_in, n_out = N_POSE_INPUTS + n_springs, N_POSE_OUTPUTS
-    shapes: dict = dict.fromkeys(("input_low", "input_high"), (n_in,))
-    shapes |= dict.fromkeys(("output_low", "output_high"), (n_out,))
-    shapes |= {"anchors": (None, n_in), "limit": (), "error_mm": ()}
-    s2r = entries.network(name, S2R, {"layers": (n_in, n_out)}, shapes)
+    s2r = entries.network(
+        name,
+        S2R,
+        {"layers": (n_in, n_out)},
+        input_low=(n_in,),
+        input_high=(n_in,),
+        output_low=(n_out,),
+        output_high=(n_out,),
+        anchors=(None, n_in),
+        limit=(),
+        error_mm=(),
+    )
     for item, holds, expected in (
         ("input_high", s2r.input_low < s2r.input_high, "more than input_low"),
         ("output_high", s2r.output_low <= s2r.output_high, "at least output_low"),
