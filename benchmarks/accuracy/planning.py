@@ -49,8 +49,8 @@ def measure(
     rods: cli.Integers = (0, 1, 2),
     recordings: Annotated[tuple[str, ...], names_of(RECORDINGS)] = tuple(RECORDINGS),
     preset: str = "payload",
-    steps: int = 1_048_576,
-    points: int = 12,
+    steps: int = 131_072,
+    points: int = 8,
     keep: cli.MaybePath = None,
 ) -> dict[str, Any]:
     """What do planned and random poses do for payloads and for goals of an arm, in the closed loop?

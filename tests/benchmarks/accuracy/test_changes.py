@@ -76,6 +76,7 @@ def test_without_the_correction_a_policy_is_asked_for_the_goals_alone(monkeypatc
     assert unshifted_mm == 0.0 and shifted_mm > 1.0
     assert row["with [mm]"] == mean["with [mm]"] == with_mm
     assert row["without [mm]"] == mean["without [mm]"] == without_mm
+    assert 0.0 < row[correction.BY_POSE] == mean[correction.BY_POSE] < 0.1 * without_mm
     with pytest.raises(InputError, match="--policies: got none, expected NAME=ARM=FILE"):
         correction.measure(())
 
