@@ -131,7 +131,10 @@ def layer_entries(name: str, layers: tuple[Layer, ...]) -> dict[str, Any]:
 
 
 class Entries:
-    """Arrays of a file, each checked when it is taken."""
+    """Arrays of a file, each checked when it is taken.
+
+    Raises SealedFileError where an entry is missing, or of the wrong type, shape or range.
+    """
 
     def __init__(self, arrays: Mapping[str, np.ndarray], source: str):
         self._source, self._arrays, self._left = source, arrays, set(arrays)

@@ -46,13 +46,7 @@ def integers(key: Array, n: int, below: Array) -> Array:
 
 
 def both(key: Array, shape_uniform: tuple[int, ...], shape_normal: tuple[int, ...]) -> tuple[Array, Array]:
-    """Return uniform numbers from 0 to below 1, and standard normal numbers, from one draw; float32.
-
-    Args:
-        key: key of the draw.
-        shape_uniform: shape of the uniform numbers.
-        shape_normal: shape of the normal numbers.
-    """
+    """Return uniform numbers from 0 to below 1 and standard normal numbers, from one draw; float32."""
     n_uniform = math.prod(shape_uniform)
     share = uniform(key, (n_uniform + math.prod(shape_normal),))
     centred = jnp.maximum(2.0 * share[n_uniform:] - 1.0, jnp.nextafter(-1.0, 0.0))  # -1 would give -infinity

@@ -24,11 +24,7 @@ class ArmModel(NamedTuple):
 
 
 def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadEstimator, SpringModel]:
-    """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries.
-
-    Raises:
-        SealedFileError: an entry is missing, or of the wrong type, shape or range.
-    """
+    """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries."""
     counts = spec.n_chambers, spec.n_springs
     return (
         take_estimator(entries, "estimator", spec.structure.n_sections, spec.n_springs),

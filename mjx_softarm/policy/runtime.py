@@ -36,16 +36,9 @@ class InMotion(NamedTuple):
 
 
 def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[Array, Array]:
-    """Return the tip pose of springs and a payload.
+    """Return the tip pose (..., 6) [mm, deg] of springs (..., n) [m] and a payload () or (...) [kg].
 
-    Args:
-        policy: policy with the networks.
-        spring_m (..., n) [m]: spring lengths.
-        load_kg () or (...) [kg]: payload.
-
-    Returns:
-        Pose (..., 6) [mm, deg], and its distance from the calibration as a share of the limit, or 0 without a
-        sim-to-real network.
+    The second result is its distance from the calibration over the limit; 0 without a sim-to-real network.
     """
     frame = estimate_frame(policy.estimator, spring_m, load_kg)
     if policy.s2r is None:

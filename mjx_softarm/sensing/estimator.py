@@ -200,11 +200,7 @@ def expected_springs(model: SpringModel, pressure_kpa: Array) -> Array:
 
 
 def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int) -> PoseEstimator:
-    """Take the estimator `name` from the entries of a file, checked.
-
-    Raises:
-        SealedFileError: an entry is missing, or of the wrong type, shape or range.
-    """
+    """Take the estimator `name` from the entries of a file."""
     n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
     return entries.network(
         name,
@@ -222,11 +218,7 @@ def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int)
 
 
 def take_spring_model(entries: Entries, name: str, n_chambers: int, n_springs: int) -> SpringModel:
-    """Take the spring model `name` from the entries of a file, checked.
-
-    Raises:
-        SealedFileError: an entry is missing, or of the wrong type, shape or range.
-    """
+    """Take the spring model `name` from the entries of a file."""
     return entries.network(
         name,
         SpringModel,

@@ -56,10 +56,7 @@ class Load(NamedTuple):
 def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
     """Return the payload (...) [kg] of an arm at rest; it may lie below 0 or above `load_scale_kg`.
 
-    Args:
-        estimator: the network.
-        spring_m (..., n_springs) [m]: spring lengths.
-        pressure_kpa (..., n_chambers) [kPa]: pressures of the chambers.
+    Its springs have lengths (..., n_springs) [m], its chambers pressures (..., n_chambers) [kPa].
     """
     return estimator.load_scale_kg * mlp(estimator.layers, _inputs(estimator, spring_m, pressure_kpa))[..., 0]
 
@@ -93,11 +90,7 @@ def averaged(load: Load, estimate_kg: float, half_width_kg: float, largest_kg: f
 
 
 def take_load_estimator(entries: Entries, name: str, n_chambers: int, n_springs: int) -> LoadEstimator:
-    """Take the estimator `name` from the entries of a file, checked.
-
-    Raises:
-        SealedFileError: an entry is missing, or of the wrong type, shape or range.
-    """
+    """Take the estimator `name` from the entries of a file."""
     n_in = n_springs + n_chambers
     return entries.network(
         name,

@@ -26,14 +26,11 @@ _RIGHT = np.array([[1, 2, 3], [0, 7, 2], [3, 0, 5], [6, 1, 0]])
 
 
 def pose_from_frame(position_m: Array, rotation: Array) -> Array:
-    """Return the pose of a frame given by its origin and axes.
+    """Return the pose (..., 6) [mm, deg] of a frame in the base frame.
 
     Args:
-        position_m (..., 3) [m]: in the base frame.
-        rotation (..., 3, 3): columns are the frame's axes in the base frame.
-
-    Returns:
-        Pose (..., 6) [mm, deg].
+        position_m (..., 3) [m]: origin.
+        rotation (..., 3, 3): axes, as columns.
     """
     xp = array_namespace(position_m, rotation)
     rows = ([rotation[..., row, column] for column in range(3)] for row in range(3))
@@ -49,14 +46,11 @@ def pose_from_frame(position_m: Array, rotation: Array) -> Array:
 
 
 def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
-    """Return the pose of a frame given by origin and quaternion, as from MuJoCo and motion capture.
+    """Return the pose (..., 6) [mm, deg] of a frame in the base frame, as from MuJoCo and motion capture.
 
     Args:
-        position_m (..., 3) [m]: in the base frame.
+        position_m (..., 3) [m]: origin.
         quaternion (..., 4): w, x, y, z, of length 1; a small error of the length does not matter.
-
-    Returns:
-        Pose (..., 6) [mm, deg].
     """
     return pose_from_frame(position_m, rotation_from_quaternion(quaternion))
 

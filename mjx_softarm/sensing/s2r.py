@@ -43,15 +43,12 @@ class S2R(NamedTuple):
 
 
 def correct(s2r: S2R, pose: Array, spring_m: Array) -> Array:
-    """Return the pose of the real tip.
+    """Return the pose (..., 6) [mm, deg] of the real tip.
 
     Args:
         s2r: the network.
         pose (..., 6) [mm, deg]: simulated, in the base frame.
         spring_m (..., n) [m]: simulated or sensed spring lengths.
-
-    Returns:
-        Pose (..., 6) [mm, deg].
     """
     return pose_from_frame(*corrected(s2r, frame_from_pose(pose), spring_m))
 
@@ -167,11 +164,7 @@ def load_s2r(path: str | Path, n_springs: int) -> S2R:
 
 
 def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
-    """Take the network `name` for an arm of n springs from the entries of a file, checked.
-
-    Raises:
-        SealedFileError: an entry is missing, or of the wrong type, shape or range.
-    """
+    """Take the network `name` for an arm of n springs from the entries of a file."""
     n_in, n_out = N_POSE_INPUTS + n_springs, N_POSE_OUTPUTS
     s2r = entries.network(
         name,

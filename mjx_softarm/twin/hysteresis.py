@@ -19,12 +19,12 @@ class StopOperators:
     """State of m stop operators on each of n displacements."""
 
     def __init__(self, stiffness: np.ndarray, limit: np.ndarray, x: np.ndarray):
-        """Start without force.
+        """Start without force, at displacements x (n,).
 
         Args:
             stiffness (n, m): stiffness of each spring, force per displacement.
             limit (n, m): largest force of each slider.
-            x (n,): displacements at the start.
+            x (n,): displacements.
         """
         self._stiffness, self._low, self._high = stiffness, -limit, limit
         self._x = np.array(x, float)

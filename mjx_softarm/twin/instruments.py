@@ -56,13 +56,10 @@ def length_ratio(spec: ArmSpec) -> float:
 
 
 def scaled_tolerances(tolerances: Any, gap: float, spec: ArmSpec, **factors: np.ndarray) -> Any:
-    """Return tolerances of an arm: times the gap; lengths in proportion to the arm's, others times `factors`.
+    """Return the tolerances of an arm, from a dataclass of those of the paper's arm.
 
-    Args:
-        tolerances: a dataclass of the paper's arm's; names of lengths end in `_m`.
-        gap: scale of all.
-        spec: the arm.
-        factors: factors by the names of fields that are no lengths.
+    All are multiplied by the gap. Lengths, whose names end in `_m`, are in proportion to the arm's lengths; other
+    fields are multiplied by `factors`, by name.
     """
     length = length_ratio(spec)
     scaled = {

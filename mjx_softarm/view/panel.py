@@ -101,12 +101,8 @@ def _bars(
 ) -> str:
     """Return n bars from feet to values, with marks across them, as SVG; a NaN has no bar.
 
-    Args:
-        levels (n,) each: feet, values and marks.
-        limits (n,) each: levels at the bottom and the top of the frames.
-        warned (n,): bool, bars with a frame in another colour.
-        words (n,): texts below the bars.
-        colours (n,): colours of the bars.
+    `levels` are feet, values and marks, between `limits` at the bottom and the top of the frames. Frames of
+    `warned` bars have another colour. `words` stand below the bars.
     """
     wide, parts = _WIDTH / len(words), []
     gap = min(10.0, wide / 3)  # between two frames

@@ -99,10 +99,9 @@ class CpxRegulators:
         return self._low_kpa + counts / COUNTS * (self._high_kpa - self._low_kpa)
 
     def _modules(self, kind: str, side: str, n_registers: int) -> tuple[list[Any], int | None]:
-        """Return the chambers' modules of a kind, and their first register; None without any.
+        """Return the chambers' modules of a kind, and their first register, or None without any.
 
-        Raises:
-            ValueError: there are too few, or they do not stand side by side.
+        Raises ValueError where there are too few, or where they do not stand side by side.
         """
         modules = [module for module in self._cpx.modules if type(module).__name__ == kind]
         if not modules:
