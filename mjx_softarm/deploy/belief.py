@@ -142,10 +142,10 @@ def believe(
 def _weighed(
     controller: Controller, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray
 ) -> tuple[Load, float, float]:
-    """Return the averaged payload, and the estimate of this window [kg] with the half-width [kg] of its interval.
+    """Return the averaged payload, this window's estimate [kg] and the half-width [kg] of its interval.
 
-    The estimate takes mean springs and pressures at rest. An estimate that is no payload leaves the specified one,
-    and so does a first one that is not known well.
+    The estimate takes mean springs and pressures at rest. An estimate that is no payload leaves the specified
+    payload, and so does a first one that is not known well.
     """
     policy, model = controller.policy, controller.policy.load_estimator
     most_kg = float(model.load_scale_kg)
