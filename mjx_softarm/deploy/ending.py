@@ -112,15 +112,13 @@ class _Finish:
         self.status, self.vented = DONE, True
 
     def run(self) -> None:
-        left = list(self._steps)
-        while left:
-            step = left[0]
-            error = self._attempt(step)
-            goes_on = error is not None and self._note(step, error)
-            if not goes_on:
-                left.pop(0)
-            while self._signals:
-                self._note(step, Terminated(self._signals.pop(0)), ended=False)
+        for step in self._steps:
+            goes_on = True
+            while goes_on:
+                error = self._attempt(step)
+                goes_on = error is not None and self._note(step, error)
+                while self._signals:
+                    self._note(step, Terminated(self._signals.pop(0)), ended=False)
 
     def on_signal(self, number: int, _frame: Any) -> None:
         """Raise in the step that the signal ends, once; note it otherwise."""
