@@ -26,6 +26,7 @@ BENCHMARKS = {
     "changes": "benchmarks.accuracy.changes:measure",
     "transfer": "benchmarks.accuracy.transfer:measure",
     "correction": "benchmarks.accuracy.correction:measure",
+    "pose-error": "benchmarks.accuracy.correction:pose_error",
     "planning": "benchmarks.accuracy.planning:measure",
     "payload": "benchmarks.accuracy.payload:measure",
     "overload": "benchmarks.accuracy.overload:measure",

@@ -76,9 +76,16 @@ def test_without_the_correction_a_policy_is_asked_for_the_goals_alone(monkeypatc
     assert unshifted_mm == 0.0 and shifted_mm > 1.0
     assert row["with [mm]"] == mean["with [mm]"] == with_mm
     assert row["without [mm]"] == mean["without [mm]"] == without_mm
-    assert 0.0 < row[correction.BY_POSE] == mean[correction.BY_POSE] < 0.1 * without_mm
     with pytest.raises(InputError, match="--policies: got none, expected NAME=ARM=FILE"):
         correction.measure(())
+
+
+def test_an_error_of_the_pose_hardly_changes_what_a_policy_asks_for(monkeypatch):
+    [row] = correction.pose_error((f"shipped=twin:0={SHIPPED}",), points=4)["policies"]
+    assert 0.0 < row["mean [mm]"] < row["95 % [mm]"] < 0.5
+    monkeypatch.setattr(correction, "POSE_ERROR", 0.0 * correction.POSE_ERROR)
+    [row] = correction.pose_error((f"shipped=twin:0={SHIPPED}",), points=4)["policies"]
+    assert row["95 % [mm]"] == 0.0
 
 
 @pytest.mark.parametrize("text", ["twin:0", "twin:0=run", "a=b=c=d", "a==c"])
