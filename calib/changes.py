@@ -106,7 +106,7 @@ def fit_changes(arm: CalibratedArm, poses: StaticPoses, seed: int = 0) -> Change
 
 
 def _fit(arm: CalibratedArm, poses: StaticPoses) -> Solution:
-    """Fit x: shifts of the zeros [m], stiffness of all and of each chamber, offsets [kPa] likewise."""
+    """Fit x: zeros [m]; stiffness of all chambers, and of each; offsets [kPa] of all, and of each."""
     spec, s2r, n_chambers = arm.spec, arm.s2r, arm.spec.n_chambers
     tip_mm = max(MIN_TIP_MM, 0.0 if s2r is None else float(s2r.error_mm))
     scale = np.array([tip_mm, MIN_TURN_RAD, MIN_KPA])

@@ -72,7 +72,7 @@ def rest_of(spec: ArmSpec, reference_m: np.ndarray) -> solver.Settled:
 def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
     """Return median, 95 % and largest distance of tips (n, 3) [mm] from their equilibria.
 
-    Arms without a truth are in none of these; `without_truth` is their number.
+    Arms without a truth are left out; `without_truth` counts them.
     """
     error = np.linalg.norm(np.asarray(tip_mm, np.float64) - truth.tip_mm, axis=-1)[truth.settled]
     errors = {name: float(f"{np.quantile(error, share):.3g}") for name, share in QUANTILES.items()}

@@ -1,4 +1,4 @@
-"""How well an arm's payload is told from springs and pressures, over the workspace.
+"""Accuracy with which springs and pressures tell an arm's payload, over the workspace.
 
 A payload m changes the pressures that hold given springs by m e. The residual pressures of the sections
 (`mjx_softarm.sensing.held_pressures`) have the covariances v_s V_s. By generalised least squares, the

@@ -64,7 +64,7 @@ def relabel(
 ) -> tuple[Transition, Array]:
     """Return a batch to learn from, and which of its rows (B,) have another goal.
 
-    With both shares zero, its rewards are those that the environment gave.
+    With both shares zero, the rewards are the environment's own.
 
     Args:
         batch: B stored transitions.

@@ -28,7 +28,7 @@ from train.agent.learner import Learner
 
 N_GOALS = 2_000
 NEAR_MM = 5.0  # tip error of an arm that has arrived, in motion
-PATH = 80  # goals that one arm goes to, one after another: as many as two laps of the circle
+PATH = 80  # goals that one arm visits in turn; two laps of the circle are one path, too
 
 
 class Reached(NamedTuple):

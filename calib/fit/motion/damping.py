@@ -21,6 +21,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
+from calib.fit.motion.parts import clusters, dense_parts
 from mjx_softarm._support.fields import PerSection, scaled
 from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
@@ -28,7 +29,6 @@ from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.spec import ArmSpec
 
-MAX_STEP_S = 0.05  # largest time between rows of a stretch
 SETTLING_S = 5.0  # start of a stretch that does not count
 MIN_COUNTED_S = 2.0
 MAX_TOTAL_S = 24.0  # length of all stretches together
@@ -139,15 +139,12 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
             continue
         payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
         # Cut the log at gaps, and where the payload changes.
-        cuts = np.flatnonzero((np.diff(log.time_s) > MAX_STEP_S) | (np.diff(payload) != 0)) + 1
-        for rows in np.split(np.arange(len(log)), cuts):
+        for rows, times_s, newest in dense_parts(log, 1.0 / spec.control.rate_hz, np.diff(payload) != 0):
             # Resample the part, if it is long enough and its pressures change after the first seconds.
-            time_s = log.time_s[rows]
-            grid = np.arange(time_s[0], time_s[-1], 1.0 / spec.control.rate_hz)[:left]
+            grid, time_s = times_s[:left], log.time_s[rows]
             if len(grid) < shortest:
                 continue
-            held = rows[np.searchsorted(time_s, grid + 1e-6, side="right") - 1]
-            pressure = log.pressure_kpa[held]
+            pressure = log.pressure_kpa[rows[newest[:left]]]
             if (np.ptp(pressure[_rows(SETTLING_S, spec) :], axis=0) <= HOLD_KPA).all():
                 continue
             tip = np.stack([np.interp(grid, time_s, log.tip_m[rows, k]) for k in range(3)], axis=1)
@@ -194,13 +191,9 @@ def _errors(stretches: Sequence[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple
 
 def _clusters(stretches: Sequence[Stretch], tips: list[np.ndarray], spec: ArmSpec) -> np.ndarray:
     """Return errors of the rows that count, one second a row; the last of a stretch is NaN-padded."""
-    size, skip, parts = _rows(CLUSTER_S, spec), _rows(SETTLING_S, spec), []
-    for stretch, tip in zip(stretches, tips, strict=True):
-        error = (tip - stretch.tip_m)[skip:]
-        padded = np.full((-(-len(error) // size) * size, 3), np.nan)
-        padded[: len(error)] = error
-        parts.append(padded.reshape(-1, size * 3))
-    return np.concatenate(parts)
+    size, skip = _rows(CLUSTER_S, spec), _rows(SETTLING_S, spec)
+    errors = ((tip - stretch.tip_m)[skip:] for stretch, tip in zip(stretches, tips, strict=True))
+    return np.concatenate([clusters(error, size).reshape(-1, size * 3) for error in errors])
 
 
 def _rows(time_s: float, spec: ArmSpec) -> int:

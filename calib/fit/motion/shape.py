@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.fit.leastsquares import QUANTILE
+from calib.fit.motion.parts import dense_parts
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.fields import scaled
 from mjx_softarm.logs.schema import Log
@@ -29,7 +30,6 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.estimator import Frame, even_pose
 from mjx_softarm.spec import ArmSpec
 
-MAX_STEP_S = 0.05  # largest time between rows of a moving arm
 MIN_S = 10.0  # length of a part of a log
 SKIPPED_S = 3.0  # start of a part, before which the arm's motion is unknown
 EVERY_S = 0.1  # time between rows that are simulated
@@ -122,12 +122,9 @@ def _parts(log: Log, spec: ArmSpec) -> list[Part]:
     base = Frame(np.asarray(params.mount.base_position_m), np.asarray(params.mount.base_rotation))
 
     # Rows at regular times of each part without a gap of times or lengths: a row less would shorten the lag
-    found, time_s = [], log.time_s
-    known = np.asarray(np.isfinite(spring_m).all(axis=1))
-    cuts = np.flatnonzero((np.diff(time_s) > MAX_STEP_S) | (known[1:] != known[:-1])) + 1
-    for part in np.split(np.arange(len(log)), cuts):
-        grid = np.arange(float(time_s[part[0]]), float(time_s[part[-1]]), EVERY_S)
-        rows = part[np.searchsorted(time_s[part], grid + 1e-6, side="right") - 1]
+    found, known = [], np.asarray(np.isfinite(spring_m).all(axis=1))
+    for part, _, newest in dense_parts(log, EVERY_S, known[1:] != known[:-1]):
+        rows = part[newest]
         seen = np.asarray(np.isfinite(tip_m[rows]).all(axis=1))
         if not known[part[0]] or np.count_nonzero(seen) * EVERY_S < MIN_S:
             continue

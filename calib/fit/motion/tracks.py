@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib.fit.motion.parts import clusters, dense_parts
 from mjx_softarm import pneumatics
 from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.logs.rest import HOLD_KPA
@@ -15,7 +16,6 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.pneumatics import Actuators
 from mjx_softarm.spec import ArmSpec
 
-MAX_STEP_S = 0.05  # largest time between rows of a track
 MIN_TRACK_S = 5.0  # length of a track
 MAX_TOTAL_S = 300.0  # length of all tracks together
 CLUSTER_S = 1.0  # errors within this time are not independent
@@ -40,16 +40,13 @@ def find_tracks(logs: Sequence[Log], spec: ArmSpec) -> list[Track]:
         if log.commanded_kpa is None or log.pressure_kpa is None or len(log) < 2:
             continue
         volume_m3 = _volumes(log, spec)
-        cuts = np.flatnonzero(np.diff(log.time_s) > MAX_STEP_S) + 1
-        for rows in np.split(np.arange(len(log)), cuts):
-            time_s = log.time_s[rows]
-            grid = np.arange(time_s[0], time_s[-1], period_s)[:left]
+        for rows, times_s, newest in dense_parts(log, period_s):
+            grid, time_s = times_s[:left], log.time_s[rows]
             changes = (np.ptp(log.commanded_kpa[rows], axis=0) > HOLD_KPA).any()
             if len(grid) < MIN_TRACK_S * spec.control.rate_hz or not changes:
                 continue
             # A row has the command that was in force before it
-            ahead = np.searchsorted(time_s, grid + 1e-6, side="right")
-            next_row = rows[np.minimum(ahead, len(rows) - 1)]
+            next_row = rows[np.minimum(newest[:left] + 1, len(rows) - 1)]
             measured, volume = (
                 np.stack([np.interp(grid, time_s, column) for column in values[rows].T], axis=1)
                 for values in (log.pressure_kpa, volume_m3)
@@ -90,12 +87,8 @@ class Runs:
 
     def clusters(self, errors: Sequence[np.ndarray]) -> np.ndarray:
         """Cut errors (n, c) of the tracks into clusters."""
-        parts = []
-        for error in errors:
-            padded = np.full((-(-len(error) // self.rows) * self.rows, self.n_chambers), np.nan)
-            padded[: len(error)] = error
-            parts.append(np.swapaxes(padded.reshape(-1, self.rows, self.n_chambers), 1, 2))
-        return np.concatenate(parts).reshape(-1, self.rows)
+        seconds = np.concatenate([clusters(error, self.rows) for error in errors])
+        return np.swapaxes(seconds, 1, 2).reshape(-1, self.rows)
 
     def rest_offset_kpa(self) -> np.ndarray:
         """Return the median of measured less commanded pressures (c,)."""
