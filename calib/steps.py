@@ -27,7 +27,8 @@ from calib.fit.payload import payload_poses, told_widths
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
-from calib.report import sections
+from calib.read.static_poses import StaticPoses
+from calib.report import motion, sections
 from calib.report.changes import CHANGES, changes_section
 from calib.report.page import Section
 from mjx_softarm.deploy.controller import LOOP
@@ -119,7 +120,7 @@ def actuators(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResul
         needed = "No log has commanded and measured pressures at the control rate."
         return StepResult(spec, Section("Actuators", f"{NOT_FITTED} {needed}"))
     fit = fit_actuators(tracks, spec, seed)
-    return StepResult(fit.spec, sections.actuators(fit))
+    return StepResult(fit.spec, motion.actuators(fit))
 
 
 def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
@@ -133,15 +134,14 @@ def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     if shape is not None and shape.is_better:
         spec, prior = shape.spec, min(shape.log_std, PRIOR)
     fit = fit_damping(stretches, spec, seed, prior)
-    return StepResult(fit.spec if fit.is_better else spec, sections.damping(fit, shape))
+    return StepResult(fit.spec if fit.is_better else spec, motion.damping(fit, shape))
 
 
 def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     """Fit the sim-to-real network, and the pressures that hold the arm, to poses of the unloaded arm."""
     # Settle the simulated arm at the spring lengths of these poses; with a payload its poses would differ.
     poses = measurements.poses.with_lengths(spec)
-    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
-    used = np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+    used = _unloaded(poses, spec)
     simulated = simulate_poses(spec, poses.spring_m[used]) if len(used) else None
     n_settled = 0 if simulated is None else int(np.count_nonzero(simulated.valid))
     n_unsettled = len(used) - n_settled
@@ -183,8 +183,7 @@ def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepRe
     """Fit what has changed since an arm's calibration to later poses of the unloaded arm."""
     spec, s2r, _ = arm
     poses = measurements.poses.with_lengths(spec)
-    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
-    poses = poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+    poses = poses.take(_unloaded(poses, spec))
     if poses.n < MIN_LATER:
         what = "pressures and spring lengths, without a payload"
         needed = f"{NOT_FITTED} {_few(MIN_LATER, what, poses.n, measurements.row_uses)}"
@@ -204,6 +203,12 @@ STEPS: Mapping[str, Step] = MappingProxyType(
         "sim-to-real network": s2r,
     }
 )
+
+
+def _unloaded(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
+    """Return the indices of the poses with spring lengths and no more than the specification's payload."""
+    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
+    return np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
 
 
 def _few(n: int, what: str, n_found: int, row_uses: Mapping[str, int]) -> str:

@@ -11,7 +11,7 @@ from calib.fit.motion import shape
 from calib.fit.motion.damping import DampingFit
 from calib.fit.motion.shape import fit_shape
 from calib.read.measurements import Measurements
-from calib.report import sections
+from calib.report import motion
 from calib.report.page import to_json
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.record import record
@@ -94,14 +94,14 @@ def test_a_lag_beyond_those_tried_is_not_believed(quick, monkeypatch):
     found = fit_shape([quick], SPEC)
     assert found.at_end and not found.is_better and found.log_std == np.inf
     assert found.rms_mm < 0.98 * found.before_rms_mm
-    section = sections.damping(DAMPING, found)
+    section = motion.damping(DAMPING, found)
     assert "the best lag of the shape, 0.31 s, is an end of those tried" in section.warnings[-1]
     assert to_json([section], [], {})["parts"]["Damping"]["figures"]["shape"]["log_std"] is None
 
 
 def test_the_report_tells_the_lag_s_own_interval(quick):
     found = fit_shape([quick], SPEC)
-    section = sections.damping(DAMPING, found)
+    section = motion.damping(DAMPING, found)
     [before, fitted] = section.tables[-1].rows
     assert fitted == ("fitted", found.lag_s, QUANTILE * found.log_std * found.lag_s, found.rms_mm)
     assert before[2] == "" and section.warnings == DAMPING.warnings
