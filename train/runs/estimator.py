@@ -117,7 +117,7 @@ def _as_measured(spec: ArmSpec, held: HeldPressures | None, pool: Any) -> Any:
 def loaded_poses(spec: ArmSpec, held: HeldPressures | None, n: int, seed: int) -> LoadedPool:
     """Draw n poses with payloads for the networks to learn from; see `distil`."""
     share = np.random.default_rng([seed, 1]).uniform(LOWEST, HIGHEST, CANDIDATES_PER_POSE * n)
-    return _loaded(spec, held, _load_max_kg(spec) * share, seed)
+    return _loaded(spec, held, (spec.mass.payload_kg + spec.mass.largest_payload_kg) * share, seed)
 
 
 def fit_load_estimator(
@@ -164,10 +164,6 @@ def _with_pressures(
     return pool._replace(pressure_kpa=jnp.asarray(kpa + spec.unmodelled_kpa(spring_m), jnp.float32))
 
 
-def _load_max_kg(spec: ArmSpec) -> float:
-    return spec.mass.payload_kg + spec.mass.largest_payload_kg
-
-
 def _stronger(spec: ArmSpec) -> ArmSpec:
     """Return the arm with more pressure: a real arm reaches spring lengths just beyond the simulated ones."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
@@ -205,7 +201,7 @@ def _first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEs
         sd_layers=initial_layers(jax.random.fold_in(key, 1), (n_in, SD_WIDTH, SD_WIDTH, 1)),
         **_scaling("spring", "m", pool.spring_m),
         **_scaling("pressure", "kpa", pool.pressure_kpa),
-        load_scale_kg=jnp.asarray(_load_max_kg(spec)),
+        load_scale_kg=jnp.asarray(spec.mass.payload_kg + spec.mass.largest_payload_kg),
     )
 
 
@@ -271,8 +267,7 @@ def _errors(learned: Distilled, spec: ArmSpec, held: HeldPressures | None) -> di
     `tip_mm` and `turn_deg` are errors of the pose network with the true load. `load_kg` is the error of arms
     whose chambers are off, `spring_mm` the error of each arm's worst spring.
     """
-    names = ("tip_mm", "turn_deg", "load_kg", "load_half_width_kg", "spring_mm")
-    found: dict[str, dict[float, Error]] = {name: {} for name in names}
+    found: dict[str, dict[float, Error]] = {}
     for share in PAYLOADS:
         payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
@@ -288,17 +283,17 @@ def _errors(learned: Distilled, spec: ArmSpec, held: HeldPressures | None) -> di
         guess = estimate_frame(learned.estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
         springs = np.abs(expected_springs(learned.spring_model, pool.pressure_kpa) - pool.spring_m)
-        found["tip_mm"][payload_kg] = _error(1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1))
-        found["turn_deg"][payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
-        found["spring_mm"][payload_kg] = _error(1e3 * springs.max(axis=-1))
         # Estimate the load of arms whose chambers are off.
         off = _loaded(spec, held, many_kg, HELD_OUT_SEED)
-        estimate_kg = np.asarray(estimate_load(learned.load_estimator, off.spring_m, off.pressure_kpa))
-        found["load_kg"][payload_kg] = _error(np.abs(estimate_kg - load_kg))
-        widths_kg = load_half_width(learned.load_estimator, off.spring_m, off.pressure_kpa)
-        found["load_half_width_kg"][payload_kg] = _error(np.asarray(widths_kg))
+        seen = learned.load_estimator, off.spring_m, off.pressure_kpa
+        errors = {
+            "tip_mm": 1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1),
+            "turn_deg": np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))),
+            "load_kg": np.abs(np.asarray(estimate_load(*seen)) - load_kg),
+            "load_half_width_kg": np.asarray(load_half_width(*seen)),
+            "spring_mm": 1e3 * springs.max(axis=-1),
+        }
+        for name, values in errors.items():
+            quantiles = (float(np.quantile(values, share)) for share in (0.5, 0.95, 1.0))
+            found.setdefault(name, {})[payload_kg] = Error(*quantiles)
     return found
-
-
-def _error(values: np.ndarray) -> Error:
-    return Error(*(float(np.quantile(values, share)) for share in (0.5, 0.95, 1.0)))
