@@ -119,6 +119,8 @@ def _run(
         raise InputError(f"{option}: got --since {since}, whose springs' lines stay, expected one of them")
     known = load_calibration(since) if since else None
     arm = known.spec if known else ArmSpec.of(spec)
+    if not (spec or since):
+        print(f"arm: {arm.name}, by default; --spec names another arm")
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
     steps = {**STEPS, "springs": functools.partial(springs, **how)}

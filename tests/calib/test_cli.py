@@ -193,6 +193,7 @@ def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys)
     shutil.copy(demo[0], springs)
     assert main(["run", str(springs), "--out", str(tmp_path / "out")]) == 1
     out = capsys.readouterr().out
+    assert out.startswith("arm: paper, by default; --spec names another arm\n")
     assert "warning: Chambers: stiffness, area and length are not this arm's" in out
     assert "warning: Sim-to-real network: policies will be trained on simulated poses" in out
     assert not (tmp_path / "out" / "s2r.npz").exists()
