@@ -1,9 +1,10 @@
 """Trained policies of rods, arms of other physics, by the poses of their calibration, in the closed loop.
 
 Recordings of a rod share their first poses, which are random. The others are chosen by `calib plan` from the
-calibration by the first ones, or random. The commands are those of `docs/calibrate.md`, but for recording: a
-pose is logged at rest, without the motion to it. A log of every tick tells the regulators. Nobody tells the
-loop what a rod carries.
+calibration by the first ones, or random. A rod's policy is trained once, by its first calibration, and
+exported with each of them: no training hides what a calibration does. The commands are those of the pages, but
+poses are logged at rest, without the motion to them. A log of every tick tells the regulators. Nobody tells
+the loop what a rod carries.
 """
 
 from __future__ import annotations
@@ -112,24 +113,25 @@ def targets(rows: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
 def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> list[dict[str, Any]]:
     """Return the rows of a rod with a recording; take them from their file if it is there."""
     preset, steps, points = settings
-    folder = _calibrated(seed, name, home)
-    run, file = folder / f"{preset}-{steps}", folder / f"{preset}-{steps}-{points}.json"
+    folder, first = _calibrated(seed, name, home), _calibrated(seed, "random", home)
+    run, file = first / f"{preset}-{steps}", folder / f"{preset}-{steps}-{points}.json"
     if file.exists():
         return json.loads(file.read_text("utf-8"))
 
-    # Train and export
-    policy = run / "policy.npz"
+    # Train by the first calibration, and export with this one
+    calibration, policy = folder / "calibration", folder / f"{preset}-{steps}.npz"
     if not (run / "evaluation.json").exists():
-        options = ("--calibration", folder / "calibration", "--learner.total-env-steps", steps)
+        options = ("--calibration", first / "calibration", "--learner.total-env-steps", steps)
         anew = ("--preset", preset, *options, "--seed", 0, "--out", run)
         arguments = ("--resume", run) if (run / "config.json").exists() else anew
         run_command("train", "reach", *arguments, makes=run / "evaluation.json")
     if not policy.exists():
-        run_command("train", "export", run, makes=policy)
+        other = () if folder == first else ("--calibration", calibration)
+        run_command("train", "export", run, *other, "--out", policy, makes=policy)
 
     # The closed loop, on the circle with payloads and on the grid
     controller = Controller.of(load_policy(policy))
-    report = json.loads((folder / "calibration/report.json").read_text("utf-8"))["parts"]
+    report = json.loads((calibration / "report.json").read_text("utf-8"))["parts"]
     shared = {
         "rod": seed,
         "recording": RECORDINGS[name],
