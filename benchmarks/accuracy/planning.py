@@ -2,7 +2,7 @@
 
 Recordings of a rod share their first poses, which are random. The others are chosen by `calib plan` from the
 calibration by the first ones, or random. A rod's policy is trained once, by its first calibration, and
-exported with each of them: no training hides what a calibration does. The commands are those of the pages, but
+exported with each of them: no training hides what a calibration does. The commands are those of the pages;
 poses are logged at rest, without the motion to them. A log of every tick tells the regulators. Nobody tells
 the loop what a rod carries.
 """
