@@ -80,7 +80,7 @@ def loads_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
             panel.plot(list(at), mean, color=colour, label=name)
             panel.vlines(list(at), mean, largest, color=colour, alpha=0.35)
         # The paper's arm
-        panel.plot([0, LIGHT_G], [PAPER_LOADS_MM] * 2, "--", color=GREY, label="the paper's arm, mean")
+        panel.plot([35, LIGHT_G], [PAPER_LOADS_MM] * 2, "--", color=GREY, label="the paper's arm, mean")
         panel.plot([HEAVY_G], [PAPER_HEAVY_MAX_MM], "x", color=GREY, label="the paper's arm, largest")
     panels[0].legend(frameon=False, fontsize=8)
     return figure
