@@ -79,7 +79,7 @@ class Symbol:
         return elementwise("logical_not", elementwise("equal", self, other))
 
     def __bool__(self) -> bool:
-        raise TypeError(f"{self.op}: a symbol has no value to decide by")
+        raise TypeError(f"{self.op}: got a symbol as a condition, expected `where`")
 
     __hash__ = object.__hash__
 

@@ -35,6 +35,7 @@ N_STRAINS = 6  # strains of an element: curvature x, y, twist [1/m], shear x, y,
 REST_STRAIN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 CREEP_S = 0.25  # time constant of the damping
 LONGEST_S = 400.0  # longest step on the way to rest
+SETTLE_STEPS = 200  # largest number of these steps
 REST_TOLERANCE = 1e-9  # largest entry of dV/dq at rest [N m^2, N m]
 _CROSS = np.zeros((3, 9))  # maps a vector to the matrix of its cross product
 _CROSS[0, [5, 7]] = _CROSS[1, [6, 2]] = _CROSS[2, [1, 3]] = -1.0, 1.0
@@ -152,10 +153,13 @@ class Rod:
         Raises:
             FloatingPointError: the rod does not come to rest.
         """
-        for k in range(200):
-            if self.step(pressure_kpa, min(0.1 * 2.0**k, LONGEST_S)) < REST_TOLERANCE:
+        left = np.inf
+        for k in range(SETTLE_STEPS):
+            left = self.step(pressure_kpa, min(0.1 * 2.0**k, LONGEST_S))
+            if left < REST_TOLERANCE:
                 return
-        raise FloatingPointError("the rod finds no rest")
+        got = f"a force of {left:.2g} N m^2 or N m after {SETTLE_STEPS} steps"
+        raise FloatingPointError(f"rod: got {got}, expected under {REST_TOLERANCE:g}")
 
     def _shape(self, half: np.ndarray, turn: np.ndarray) -> tuple[Shape, np.ndarray, np.ndarray]:
         """Return the shape, and the axes (n, 3, 3) at the beginning and in the middle of each element."""
