@@ -176,6 +176,7 @@ def figures(
     away, turned = _norms(error, asked)
     per_point = accuracy.saturated.sum(axis=1)
 
+    # Figures of translation, rotation and each axis; of belief, saturation and faults
     return {
         "points": len(accuracy.goal),
         "measured": n_measured,
