@@ -58,7 +58,7 @@ def train_network(
     Returns:
         Weights with the least loss on the stopping rows; losses (n_epochs,) on these rows.
     """
-    # Split the rows into those that are learned and those that stop the training, and fill whole batches.
+    # Split the rows into learned rows and stopping rows, and fill whole batches.
     n = len(jax.tree.leaves(rows)[0])
     stops = np.arange(n) % STOP_EVERY == 0 if stop is None else stop
     learned = jax.tree.map(lambda x: jnp.asarray(x)[~stops], rows)

@@ -5,7 +5,7 @@ has
 
     read_sensors() -> (n,)           needed    readings, in the unit of the specification's sensor
     write_pressures((c,))            needed    pressures to regulate to [kPa]
-    pressures() -> (c,)              optional  pressures measured [kPa], logged in place of those commanded
+    pressures() -> (c,)              optional  measured pressures [kPa], logged in place of the commands
     motion_capture() -> Capture      optional  tip (3,), (4,), markers (m, 3), springs (n,); for calibration
     time_s                           optional  clock [s] of a simulated arm, for which no tick waits
 

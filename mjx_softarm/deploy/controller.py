@@ -31,7 +31,7 @@ class LoopConfig:
     # Largest difference of the two half windows' means, of springs 67 mm from the axis; in proportion for
     # others, whose change bends a section more. 10 times such a mean's noise.
     still_m: float = 2e-4
-    settle_timeout_s: float = 15.0  # longest wait for rest; by hand, well above those 4 s
+    settle_timeout_s: float = 15.0  # longest wait for rest; by hand, well above the 4 s of a twin
 
     # Shift of the goal that the policy is given [mm], [deg].
     max_shift: tuple[float, float] = (25.0, 5.0)  # by hand

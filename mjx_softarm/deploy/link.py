@@ -55,7 +55,7 @@ class Link:
         self._spec, self._dt_s, self._n_late = spec, dt_s, 0
         self._simulated = hasattr(arm, "time_s")
         self.measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
-        # Shapes of logged arrays; those of markers come from the first frame.
+        # Shapes of logged arrays; the first frame gives the shape of the markers.
         self._shapes: dict[str, tuple[int, ...]] = {"tip_m": (3,), "tip_quaternion": (4,)}
         self._unsure = False  # the arm may have taken the last pressures, but has not confirmed them
         self.pressure_kpa = np.zeros(spec.n_chambers)  # in force
@@ -113,9 +113,9 @@ class Link:
         return True
 
     def look(self, time_s: float) -> dict[str, Any]:
-        """Return time, pressures and motion capture, the latter unless it missed a frame.
+        """Return a row of the log: time, pressures, and motion capture unless it missed a frame.
 
-        The pressures are the commanded ones if the arm measures none; otherwise the row has both.
+        If the arm measures no pressures, the row has the commanded ones; otherwise it has both.
 
         Raises:
             ArmFault: a method failed, or the shape of an array changed.

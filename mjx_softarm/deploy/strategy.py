@@ -52,7 +52,7 @@ class AtRest(NamedTuple):
         has arrived.
         """
         policy, config = belief.controller.policy, belief.controller.config
-        # The first action does without a shift; the next ones correct what it leaves.
+        # The first action has no shift; the next actions correct the error that it leaves.
         if not self.n_actions:
             return self._act(belief, goal, [np.zeros(6)])
         if _waits(belief, config.settle_timeout_s):

@@ -82,7 +82,7 @@ class Machine:
     def answer(self, row: np.ndarray) -> np.ndarray:
         """Return the outputs of inputs, with the columns of `Golden`."""
         restart, new_goal, late, taken, lost, checked = row[: len(FLAGS)] > 0.5
-        # Follow the flags that say what happened before this tick.
+        # Follow the flags of events before this tick.
         if restart:
             self._restart()
         if not taken:

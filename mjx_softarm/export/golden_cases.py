@@ -110,7 +110,7 @@ def _single_rows(controller: Controller, rng: np.random.Generator) -> Iterator[n
 
 
 def _checked_rows(controller: Controller, rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Yield goals inside the workspace: up to half of N_CHECKED beyond reach, and as many within."""
+    """Yield goals inside the workspace: up to half of N_CHECKED beyond reach, up to half within."""
     policy, n = controller.policy, controller.policy.spec.n_chambers
     goals = rng.choice(policy.workspace, _CANDIDATES)
     goals = goals + rng.normal(0.0, [5.0] * 3 + [30.0] * 3, goals.shape)

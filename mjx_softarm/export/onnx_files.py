@@ -111,7 +111,7 @@ class _Writer:
 
     def __init__(self, prefix: str = "v", tensors: dict[str, onnx.TensorProto] | None = None) -> None:
         self.nodes: list[onnx.NodeProto] = []
-        self.tensors = {} if tensors is None else tensors  # a loop's body shares those of its graph
+        self.tensors = {} if tensors is None else tensors  # a loop's body shares its graph's tensors
         self._names: dict[Symbol, str] = {}
         self._prefix = prefix
 

@@ -39,7 +39,7 @@ def policy_from_actor(
             `activation`, `observation`, `tolerance_m`, `n_actions`, `action_s`.
 
     Raises:
-        ValueError: the parameters are not those of an actor for this arm. It is a SealedFileError if an
+        ValueError: the parameters do not belong to an actor for this arm. It is a SealedFileError if an
             array has the wrong shape or is not finite.
     """
     policy = Policy(
@@ -59,7 +59,7 @@ def policy_from_actor(
 
 
 def check_actor(actor_params: Mapping[str, Any], spec: ArmSpec) -> None:
-    """Raise ValueError where the parameters, as for `policy_from_actor`, are not those of an actor."""
+    """Raise ValueError where parameters, as for `policy_from_actor`, do not belong to an actor."""
     _layers_from_flax(actor_params, spec.n_springs)
 
 

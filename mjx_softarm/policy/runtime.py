@@ -121,7 +121,7 @@ class PolicyRunner:
         return Reference(readings, actions.sensor.lengths(readings).length_m)
 
     def action(self, pose: ArrayLike, goal: ArrayLike, sensed: ArrayLike | None = None) -> np.ndarray:
-        """Return the action (..., n) in [-1, 1], float32; arguments as those of `act`.
+        """Return the action (..., n) in [-1, 1], float32; arguments as for `act`.
 
         Raises:
             ValueError: pose or goal has a wrong shape or is not finite, the actor overflows, or `sensed` is

@@ -1,6 +1,6 @@
-"""Pressures that hold a calibrated arm at rest, less those of its simulation: a process for each section.
+"""Pressures that hold a calibrated arm at rest, minus the simulated ones: a process for each section.
 
-Real chambers harden, and their areas grow with pressure; those of the simulation do not. The residual depends
+Real chambers harden, and their areas grow with pressure; simulated chambers do not. This residual depends
 on a section's own springs and pressures, not on the load below it. So the residual of the c chambers of a
 section is a Gaussian process of the section's state u: its spring lengths and simulated pressures,
 standardised. With the covariance V (c, c) between chambers,

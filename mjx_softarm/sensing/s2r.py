@@ -137,7 +137,7 @@ def carry_body(plate_position: Array, plate_rotation: Array, real_pose: Array) -
 
 
 def _normalised(s2r: S2R, x: Array) -> Array:
-    """Scale inputs (..., n_in), so that those of the training rows lie in [-1, 1]."""
+    """Scale inputs (..., n_in) by the range of the training rows, whose inputs then lie in [-1, 1]."""
     return 2.0 * (x - s2r.input_low) / (s2r.input_high - s2r.input_low) - 1.0
 
 

@@ -56,7 +56,7 @@ def length_ratio(spec: ArmSpec) -> float:
 
 
 def scaled_tolerances(tolerances: Any, gap: float, spec: ArmSpec, **factors: np.ndarray) -> Any:
-    """Return the tolerances of an arm, from a dataclass of those of the paper's arm.
+    """Return the tolerances of an arm, from a dataclass with the paper's arm's tolerances.
 
     All are multiplied by the gap. Lengths, whose names end in `_m`, are in proportion to the arm's lengths;
     other fields are multiplied by `factors`, by name.

@@ -41,9 +41,9 @@ from mjx_softarm.twin.rod import Rod, RodParts
 
 ELEMENTS_PER_SECTION = 6  # tip within 0.2 mm of that with twelve elements
 AIR_STEPS = 4  # time steps of the chambers' air in a control period
-# Bounds of a rod's regulators: about those of the public logs of a real arm, see `benchmarks regulators`.
-# Rates and deadband are in proportion to the arm's range of pressures. Lag and rates are those of a chamber
-# of constant length. A chamber expands as it fills: the pressures of the paper's arm change half as fast.
+# Bounds of a rod's regulators, about as in the public logs of a real arm, see `benchmarks regulators`. Rates
+# and deadband are in proportion to the arm's range of pressures. Lag and rates hold for a chamber of constant
+# length. A chamber expands as it fills: the pressures of the paper's arm change half as fast.
 LAG_S, DEAD_TIME_S = (0.15, 0.6), (0.05, 0.25)
 FILL_PER_S, VENT_PER_S = (1.4, 2.8), (0.8, 1.8)  # in ranges of pressure
 DEADBAND = (1 / 600, 4 / 600)  # in ranges of pressure; 0.1 to 0.4 kPa of the paper's arm
@@ -90,7 +90,7 @@ class RodTwin(InstrumentedArm):
         session: int = EVALUATION_SESSION,
         build: Build = AS_BUILT,
     ):
-        """Hang the arm up, unpressurised and at rest; arguments as those of `Twin`."""
+        """Hang the arm up, unpressurised and at rest; arguments as for `Twin`."""
         self._spec = spec or ArmSpec.default()
         self._per_section = build.per_section or ELEMENTS_PER_SECTION
         rng = np.random.default_rng(seed)
@@ -275,11 +275,11 @@ def _sensor(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances) -> Sens
 
 
 def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:
-    """Return an arm's tolerances: lengths and compliances scale with those of the paper's arm."""
+    """Return an arm's tolerances; lengths and compliances are in proportion to the arm's."""
     paper = ArmSpec.default()
 
     def ratio(of_paper: PerSection, own: PerSection) -> np.ndarray:
-        """Return the paper's mean number over those of the arm's sections (n_sections,)."""
+        """Return the paper's mean number, divided by the numbers of the arm's sections (n_sections,)."""
         return np.mean(of_paper) / np.array(spec.per_section(own))
 
     bending = ratio(paper.backbone.bending_stiffness_nm_per_rad, spec.backbone.bending_stiffness_nm_per_rad)

@@ -29,7 +29,7 @@ MOST = 20  # number of packets that one poll reads at most, so that a flood does
 
 
 class _Enough(Exception):
-    """A poll has read as many packets as it may."""
+    """Signal that a poll has read the largest number of packets."""
 
 
 class NatNet:

@@ -1,7 +1,7 @@
 """Frames of Qualisys Track Manager over its real-time protocol, by the package `qtm-rt`.
 
-Positions come in millimetres, axes as a matrix column by column, and what is not seen as NaN. QTM does not
-tell how old a frame is when it is sent.
+Positions come in millimetres, axes as a matrix column by column. Unseen bodies and markers are NaN. QTM does
+not tell how old a frame is when it is sent.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Qualisys:
 
     def poll(self) -> CaptureFrame | None:
         """Return the newest frame since the last call, None without one, at once; see `Source`."""
-        # Let the loop take what has come; a lost connection is begun again beside it.
+        # Let the event loop take the packets that have come, and try to connect again after a loss.
         if not self._connected() and (self._task is None or self._task.done()):
             self._task = self._loop.create_task(self._again())
         self._loop.run_until_complete(asyncio.sleep(0))

@@ -44,7 +44,7 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
     Raises:
         InputError: it is another; the message begins with `name`.
     """
-    # Readings, given as many ticks as a run gives lost ones
+    # Readings; a run, too, waits `lost_ticks` ticks for them
     policy, spec = controller.policy, controller.policy.spec
     length_m = np.full(spec.n_springs, np.nan)
     for _ in range(controller.config.lost_ticks):
