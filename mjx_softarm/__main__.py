@@ -61,8 +61,8 @@ def _picture(
     _import_mujoco()
     from PIL import Image
 
+    from mjx_softarm.mechanics.drawing.render import Renderer
     from mjx_softarm.mechanics.mjcf import build_model
-    from mjx_softarm.mechanics.render import Renderer
     from mjx_softarm.mechanics.settle import SettleResult
     from mjx_softarm.mechanics.workspace import settle_many
 
@@ -98,7 +98,7 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     arm = ArmSpec.of(spec)
     _import_mujoco()
     with needing("sim", "drawing"):
-        from mjx_softarm.mechanics import workspace_plot as plot
+        from mjx_softarm.mechanics.drawing import workspace_plot as plot
     from mjx_softarm.mechanics.workspace import extreme_poses, settle_many
 
     # Settle at all combinations, or at as many random pressures.

@@ -16,8 +16,8 @@ from benchmarks.paper.film import HEIGHT, WIDTH, SideView, frames, write_gif
 from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.mechanics.drawing.render import Renderer
 from mjx_softarm.mechanics.mjcf import build_model
-from mjx_softarm.mechanics.render import Renderer
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from train.runs.evaluate import nominal, towards
 from train.runs.folder import Run

@@ -144,7 +144,7 @@ def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
 def film_trial(folder: Path, settings: Settings, trial: Trial, file: str) -> str:
     """Film a trial; return why it cannot be drawn, or ""."""
     from benchmarks.paper.film import film
-    from mjx_softarm.mechanics.render import RenderError
+    from mjx_softarm.mechanics.drawing.render import RenderError
 
     try:
         film(folder / file, scene_of(folder, settings, trial), trial)

@@ -9,9 +9,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from mjx_softarm import ArmSpec
+from mjx_softarm.mechanics.drawing.render import Camera, Renderer
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.render import Camera, Renderer
 from mjx_softarm.mechanics.workspace import settle_many
 
 HERE = Path(__file__).parent

@@ -18,14 +18,14 @@ from mjx_softarm.spec import ArmSpec
 class Walls:
     """Pipe around an arm. Without a pipe, distances are infinite."""
 
-    def __init__(self, diameter_mm: float | None, spec: ArmSpec, params: ArmParams, s2r: S2R | None):
-        if diameter_mm is not None and not hangs(spec):
+    def __init__(self, pipe: CrossPipe | None, spec: ArmSpec, params: ArmParams, s2r: S2R | None):
+        if pipe is not None and not hangs(spec):
             raise InputError(
-                f"pipe_diameter_mm: got {diameter_mm:g} for the arm {spec.name!r}, whose base is turned by "
-                f"{spec.mounting.base_turn_deg} deg, expected an arm that hangs: pipes are entered from above"
+                f"pipe_diameter_mm: got {1e3 * pipe.diameter_m:g} for the arm {spec.name!r}, whose base is "
+                f"turned by {spec.mounting.base_turn_deg} deg, expected an arm that hangs: pipes are entered "
+                "from above"
             )
-        self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
-        self.spec, self.params, self.s2r = spec, params, s2r
+        self.pipe, self.spec, self.params, self.s2r = pipe, spec, params, s2r
 
     def clearance_mm(self, q: Array, pose: Array) -> Array:
         """Return the distance () of the body at joint coordinates (nv,), with its tip at a pose (6,)."""

@@ -75,9 +75,19 @@ class EnvConfig:
     """time step in dynamic mode, at most; no longer than a control period. By mjx.step, 0.002 is as exact as
     0.02 by the engine chain"""
     pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
-    """cross-shaped pipe around the arm, without contact"""
+    """cross-shaped pipe around the arm"""
+    pipe_lip_mm: float = 0.0  # length of the plates that hang from the upper edges of its side branches
+    pipe_contact: bool = False
+    """the wall acts on the simulated arm; else it is there for clearances alone"""
     clearance_cost_per_mm: float = 0.0  # cost per mm of clearance below the margin
     clearance_margin_mm: float = 10.0  # clearance of the body to the wall from which there is no cost
+
+    @property
+    def pipe(self) -> CrossPipe | None:
+        """Pipe around the arm, if there is one."""
+        if self.pipe_diameter_mm is None:
+            return None
+        return CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)
 
     @property
     def moves(self) -> bool:
@@ -138,7 +148,10 @@ class EnvConfig:
         _expect(self.randomisation, "friction_max_n", no_friction, "0 with the engine 'warp'")
 
         # Pipe
-        no_cost = self.pipe_diameter_mm is not None or not self.clearance_cost_per_mm
-        _expect(self, "clearance_cost_per_mm", no_cost, "0 without a pipe_diameter_mm")
+        for name in ("clearance_cost_per_mm", "pipe_lip_mm", "pipe_contact"):
+            without = self.pipe_diameter_mm is not None or not getattr(self, name)
+            _expect(self, name, without, "0 without a pipe_diameter_mm")
+        other_engine = self.moves and self.engine != "chain"
+        _expect(self, "pipe_contact", not (self.pipe_contact and other_engine), "false with this engine")
         if self.pipe_diameter_mm is not None:
-            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError
+            CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)  # raises ValueError

@@ -14,12 +14,14 @@ from jax import Array
 
 from mjx_softarm._support.small_matrices import eliminate, identity, product, products
 from mjx_softarm.control import YIELD_M_PER_KPA, Allocation
+from mjx_softarm.mechanics.contact import step_share
 from mjx_softarm.mechanics.implicit import PressureResponse, gain_columns
 from mjx_softarm.mechanics.kinematics import Frames, Kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import Statics, statics
 
 MAX_ITERATIONS = 12
+MAX_ITERATIONS_IN_CONTACT = 36  # balls come to the wall one after another
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0  # c
 MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
 SMALL_STEP = 3e-4  # [m, rad]; Newton's method converges quadratically from here
@@ -38,9 +40,10 @@ class Iterate(NamedTuple):
     convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
     iteration: Array  # (*arms,) int
 
-    def goes_on(self, n_small: Array | int) -> Array:
+    def goes_on(self, n_small: Array | int, params: ArmParams) -> Array:
         """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
-        return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
+        most = MAX_ITERATIONS if params.contact is None else MAX_ITERATIONS_IN_CONTACT
+        return (self.n_small < n_small) & (self.iteration < most + n_small - 1)
 
 
 class End(NamedTuple):
@@ -62,7 +65,7 @@ def newton_pass(
     joints' response to the law's gain is solved for in the place of a Newton step.
     """
     # Forces and springs at the iterate
-    goes_on, held = it.goes_on(n_small), it.held & ~it.at_limit
+    goes_on, held = it.goes_on(n_small, params), it.held & ~it.at_limit
     is_last = ~jnp.any(goes_on)
     clipped = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     pressure = jnp.where(is_last, clipped, it.pressure)
@@ -79,17 +82,28 @@ def newton_pass(
     solved = jax.lax.cond(is_last & ~jnp.any(held), jnp.zeros_like, hessian.solve, columns)
 
     # Step of the arms that go on
-    moved = _newton_step(it._replace(pressure=pressure), here, solved, params, reference_m)
+    at = it._replace(pressure=pressure)
+    moved = _newton_step(at, kinematics, frames, here, solved, params, reference_m)
     moved = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), moved, it)
     by_law = solved[:, :, : len(reference_m)].reshape(len(it.q), *reference_m.shape)
     return moved, End(pressure, frames, here, by_law)
 
 
-def _newton_step(it: Iterate, here: Statics, solved: Array, params: ArmParams, reference_m: Array) -> Iterate:
+def _newton_step(
+    it: Iterate,
+    kinematics: Kinematics,
+    frames: Frames,
+    here: Statics,
+    solved: Array,
+    params: ArmParams,
+    reference_m: Array,
+) -> Iterate:
     """Return the iterate after a step in joint coordinates and pressures together: H dq = B dp - grad V.
 
     Args:
         it: iterate.
+        kinematics: of either engine.
+        frames: at the iterate.
         here: forces and springs at the iterate.
         solved (n_sections, n, 1 + n_chambers, *arms): H^-1 [-grad V, B].
         params: numbers of the arm.
@@ -114,9 +128,11 @@ def _newton_step(it: Iterate, here: Statics, solved: Array, params: ArmParams, r
     # from now on; if it does already, or none tracks, the joints are stiffer for a step
     largest = jnp.max(jnp.abs(dq), axis=0)
     scale = jnp.minimum(1.0, MAX_STEP / largest)
+    if params.contact is not None:
+        scale = scale * step_share(params.contact, frames, kinematics(it.q + scale * dq))
     finite = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
     convex = finite & (it.stiffening == 0)
-    small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < SMALL_STEP) & convex
+    small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < _small_step(params)) & convex
     return Iterate(
         q=jnp.where(finite, it.q + scale * dq, it.q),
         pressure=jnp.where(finite, it.pressure + scale * dp, it.pressure),
@@ -128,6 +144,11 @@ def _newton_step(it: Iterate, here: Statics, solved: Array, params: ArmParams, r
         convex=convex,
         iteration=it.iteration + 1,
     )
+
+
+def _small_step(params: ArmParams) -> float:
+    """Return the largest entry of a small step; a wall's stiffness changes within less than a millimetre."""
+    return SMALL_STEP if params.contact is None else 0.1 * SMALL_STEP
 
 
 def law_errors(spring_error_m: Array, pressure_kpa: Array, allocation: Allocation | None) -> Array:

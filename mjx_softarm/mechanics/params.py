@@ -11,6 +11,7 @@ from jax import Array
 
 from mjx_softarm.control import Allocation, allocation
 from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_directions
+from mjx_softarm.mechanics.pipe import Contact
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
@@ -19,6 +20,8 @@ from mjx_softarm.spec_tables import LEAST_CHAMBERS
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
+
+jax.tree_util.register_static(Contact)
 
 
 class Mount(NamedTuple):
@@ -60,6 +63,7 @@ class ArmParams(NamedTuple):
     pressure_max_kpa: Array  # (n_chambers,)
     mount: Mount
     allocation: Allocation | None = None  # of arms with redundant chambers, see `mjx_softarm.control`
+    contact: Contact | None = None  # with the wall of a pipe around the arm
 
     @property
     def n_sections(self) -> int:

@@ -28,6 +28,7 @@ from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.errors import Result
+from mjx_softarm.mechanics.contact import is_jammed
 from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
 from mjx_softarm.mechanics.newton import End, Iterate, law_errors, newton_pass
@@ -44,7 +45,11 @@ class SettleResult(Result):
 
     CONVERGED = 0, "forces balance, and every spring is at its reference or its chamber at a limit"
     OUT_OF_ITERATIONS = 1, "forces or springs are off by more than the tolerance after the last iteration"
-    NOT_CONVEX = 2, "its energy is not convex there, so it buckles, or its springs do not follow its chambers"
+    NOT_CONVEX = (
+        2,
+        "its energy is not convex there, so it buckles or is stuck beyond an edge of a wall, or its springs "
+        "do not follow its chambers",
+    )
     NOT_FINITE = 3, "a force or a length is not a finite number"
 
 
@@ -187,7 +192,7 @@ def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m:
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         _, it, end = jax.lax.while_loop(
             lambda loop: loop[0],
-            lambda loop: (jnp.any(loop[1].goes_on(n_small)), *one_pass(loop[1])),
+            lambda loop: (jnp.any(loop[1].goes_on(n_small, params)), *one_pass(loop[1])),
             (jnp.array(True), start, nothing),
         )
         return _report(it, end, params, reference_m)
@@ -206,11 +211,12 @@ def _report(it: Iterate, end: End, params: ArmParams, reference_m: Array) -> _So
     tracking = jnp.max(jnp.where(params.pinned, 0.0, off), axis=0)
 
     # Result, and all fields of the equilibrium; forces balance in an arm that is about to buckle, too
-    good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M) & it.convex
+    convex = it.convex if params.contact is None else it.convex & ~is_jammed(params.contact, frames)
+    good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M) & convex
     numbers = here.gradient, error, params.law_stiffness
     finite = functools.reduce(jnp.logical_and, (jnp.all(jnp.isfinite(x), axis=0) for x in numbers))
     result = jnp.select(
-        [~finite, good, ~it.convex],
+        [~finite, good, ~convex],
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
         SettleResult.OUT_OF_ITERATIONS.value,
     )

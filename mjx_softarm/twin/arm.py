@@ -179,12 +179,12 @@ class Twin(InstrumentedArm):
         return self._wall_force
 
     def renderer(self, width: int, height: int) -> Any:
-        """Return a `mjx_softarm.mechanics.render.Renderer` of this twin, for `draw`.
+        """Return a `mjx_softarm.mechanics.drawing.render.Renderer` of this twin, for `draw`.
 
         Raises:
             RenderError: OpenGL is missing.
         """
-        from mjx_softarm.mechanics.render import Renderer
+        from mjx_softarm.mechanics.drawing.render import Renderer
 
         return Renderer(self._model, width, height)
 
@@ -193,7 +193,7 @@ class Twin(InstrumentedArm):
 
         A pipe is cut open and seen from the front, along +y. A payload is a ball at the finger tips.
         """
-        from mjx_softarm.mechanics.render import Camera
+        from mjx_softarm.mechanics.drawing.render import Camera
 
         payload_kg = float(self._model.body("payload").mass[0])
         return renderer.draw(

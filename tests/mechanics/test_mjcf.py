@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.mechanics import render
+from mjx_softarm.mechanics.drawing import render
 from mjx_softarm.mechanics.mjcf import build_model
 
 LOW_KPA, FREE_KPA, HIGH_KPA = -40.0, 0.0, 20.0

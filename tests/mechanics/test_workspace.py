@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.__main__ import _tell_lengths, main
+from mjx_softarm.mechanics.drawing.workspace_plot import outline
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.workspace import (
@@ -25,7 +26,6 @@ from mjx_softarm.mechanics.workspace import (
     sample_workspace,
     settle_many,
 )
-from mjx_softarm.mechanics.workspace_plot import outline
 from tests.arms import SIX_CHAMBERS
 
 SPEC = ArmSpec.default()

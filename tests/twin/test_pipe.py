@@ -8,10 +8,10 @@ from scipy.spatial import ConvexHull
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.drivers.names import open_arm
+from mjx_softarm.mechanics.drawing.render import RenderError
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance, clearance
-from mjx_softarm.mechanics.render import RenderError
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import Build
 from mjx_softarm.twin.model import build_twin, draw_parts

@@ -1,0 +1,1 @@
+"""Pictures of the arm and of its workspace."""
