@@ -42,6 +42,7 @@ N_FRAMES = 50  # averaged frames of a logged pose: a second
 FIRST, MORE_SEED, MOVING_SEED = 500, 1_000, 2_000  # random poses of all; seeds of other poses, plus the rod's
 RECORDINGS = {"random": "500 random", "planned": "500 random, 200 planned", "more": "700 random"}
 N_MORE = 200
+GRID_POINTS = 20  # goals of the grid, at most
 CIRCLE_MM = {0: 1.5, 500: 1.5, 1000: 2.0}  # targets by payload [g]: mean error on the circle
 BELIEVED_MM, PAYLOAD_G, HALF, QUARTER_OFF = 0.5, 60.0, 0.5, 0.75  # other targets
 
@@ -61,7 +62,7 @@ def measure(
         recordings: names of recordings
         preset: of each training
         steps: environment steps of each training
-        points: goals of the circle, and of the grid at most
+        points: goals of the circle
         keep: folder for logs, calibrations and runs, to go on with later; without one they are deleted
     """
     xla.enable_compilation_cache()
@@ -111,15 +112,16 @@ def targets(rows: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
 
 
 def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> list[dict[str, Any]]:
-    """Return the rows of a rod with a recording; take them from their file if it is there."""
+    """Return the rows of a rod with a recording; take those from their files that are there."""
     preset, steps, points = settings
     folder, first = _calibrated(seed, name, home), _calibrated(seed, "random", home)
-    run, file = first / f"{preset}-{steps}", folder / f"{preset}-{steps}-{points}.json"
-    if file.exists():
-        return json.loads(file.read_text("utf-8"))
 
     # Train by the first calibration, and export with this one
-    calibration, policy = folder / "calibration", folder / f"{preset}-{steps}.npz"
+    run, calibration, policy = (
+        first / f"{preset}-{steps}",
+        folder / "calibration",
+        folder / f"{preset}-{steps}.npz",
+    )
     if not (run / "evaluation.json").exists():
         options = ("--calibration", first / "calibration", "--learner.total-env-steps", steps)
         anew = ("--preset", preset, *options, "--seed", 0, "--out", run)
@@ -130,7 +132,6 @@ def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> l
         run_command("train", "export", run, *other, "--out", policy, makes=policy)
 
     # The closed loop, on the circle with payloads and on the grid
-    controller = Controller.of(load_policy(policy))
     report = json.loads((calibration / "report.json").read_text("utf-8"))["parts"]
     shared = {
         "rod": seed,
@@ -139,14 +140,16 @@ def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> l
         "S2R, held out [mm]": report["Sim-to-real network"]["figures"]["test"]["translation_mean_mm"],
     }
     rows = []
-    for goals, payload_g in [("circle", g) for g in CIRCLE_MM] + [("grid", 0)]:
-        poses = read_goals(goals, controller.policy, points)
-        arm = RodTwin(seed, payload_kg=1e-3 * payload_g)
-        run_to_end = follow(arm, controller, list(poses))
-        row = shared | {"goals": goals, "payload [g]": payload_g}
-        rows.append(row | of_run(run_to_end, controller, poses, payload_g))
+    for goals, payload_g, n in [("circle", g, points) for g in CIRCLE_MM] + [("grid", 0, GRID_POINTS)]:
+        file = policy.with_name(f"{policy.stem}-{goals}-{n}-{payload_g}g.json")
+        if not file.exists():
+            controller = Controller.of(load_policy(policy))
+            poses, arm = read_goals(goals, controller.policy, n), RodTwin(seed, payload_kg=1e-3 * payload_g)
+            run_to_end = follow(arm, controller, list(poses))
+            write_json(file, of_run(run_to_end, controller, poses, payload_g))
+        found = json.loads(file.read_text("utf-8"))
+        rows.append(shared | {"goals": goals, "payload [g]": payload_g, **found})
         print(rows[-1], flush=True)
-    write_json(file, rows)
     return rows
 
 
