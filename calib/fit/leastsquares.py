@@ -12,7 +12,7 @@ Statistics" (1981), section 7; clusters: Bell and McCaffrey, Survey Methodology 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -64,18 +64,27 @@ class Solution(NamedTuple):
         return QUANTILE * np.sqrt(np.diag(self.covariance))
 
 
-def fit(model: Model, problem: Problem) -> Solution:
-    """Minimise Huber's loss of the errors over their scales, started from x = 0."""
+def fit(
+    model: Model, problem: Problem, rounds: Sequence[str] = ROUNDS, end: Mapping[str, Any] = TOLERANCES
+) -> Solution:
+    """Minimise Huber's loss of the errors over their scales, started from x = 0.
+
+    Args:
+        model: errors and their Jacobian.
+        problem: scales and prior.
+        rounds: losses, as SciPy names them.
+        end: end of a round, as SciPy has it.
+    """
     model = _remembering(model)
     x, scale = np.zeros(len(problem.prior)), problem.scale
-    for loss in ROUNDS:
-        x = descend(model, x, scale, problem, loss, TOLERANCES)
+    for loss in rounds:
+        x = descend(model, x, scale, problem, loss, end)
         scale = _scales(model(x)[0], problem)
     return refine(model, x, problem)
 
 
 def descend(
-    model: Model, x: np.ndarray, scale: np.ndarray, problem: Problem, loss: str, end: dict[str, Any]
+    model: Model, x: np.ndarray, scale: np.ndarray, problem: Problem, loss: str, end: Mapping[str, Any]
 ) -> np.ndarray:
     """Minimise a loss of the errors from x (p,), with scales (n_groups,) that stay; `end` is SciPy's."""
     model, prior = _remembering(model), np.diag(1.0 / problem.prior)

@@ -1,33 +1,25 @@
 """Robust lines y = slope x / (1 - share x) + offset, straight without a share, with held-out errors.
 
-Optax's L-BFGS minimises Huber's loss, whose scale comes from the residuals: a few gross outliers hardly
-matter.
+Huber's loss has the scale of the residuals (`calib.fit.leastsquares`): a few gross outliers hardly matter.
 """
 
 from __future__ import annotations
 
-import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
-from jax import Array
 
 from calib.errors import FitError
 from calib.fit.blocks import block_rows, folds
-from calib.fit.leastsquares import SIGMA_PER_MEDIAN, Problem, solution_at
-from mjx_softarm._support.xp import array_namespace
+from calib.fit.leastsquares import Problem, fit
 
 HUBER = 1.345  # standard deviations of the noise; 95 % of the efficiency of least squares
 DOWN_WEIGHTED = 2 * HUBER  # error from which a row counts less than half
-ROUNDS = 5  # rounds of the fit; each finds the scale, then the parameters
-ITERATIONS = 40  # iterations of L-BFGS in a round
+ROUNDS = ("linear", *["huber"] * 4)  # losses; each round has the scale of the round before
+TOLERANCES = {"max_nfev": 15, "ftol": 1e-9, "xtol": 1e-7, "gtol": None}  # end of a round
 PRIOR = 10.0  # standard deviation of standardised parameters: next to no prior
 STRETCHES = 50  # clusters of the intervals: neighbouring rows err alike
 STUDENT = 2.0096  # 97.5 % quantile for STRETCHES - 1 degrees of freedom
-PADDED_ROWS = 1_024  # tables are padded to a multiple of it
 MIN_ROWS = 50
 BLOCK = 100  # rows of one spring that are held out together
 EDGE = 0.05  # share of the range of the other rows by which a held-out row may exceed it
@@ -92,7 +84,7 @@ def fit_line(
     # Compare all rows with the lines.
     wire, sides = wire_length(x, lines.share), np.array([-1.0, 1.0])
     residual = y - lines.slope * wire - lines.offset
-    fit = LineFit(
+    found = LineFit(
         slope=lines.slope,
         offset=lines.offset,
         slope_interval=lines.slope[:, None] + lines.slope_width[:, None] * sides,
@@ -107,17 +99,18 @@ def fit_line(
         share=lines.share,
         share_interval=(lines.share - lines.share_width, lines.share + lines.share_width),
     )
-    warnings = _warnings(fit, wire, "all springs " if shared else "spring")
+    warnings = _warnings(found, wire, "all springs " if shared else "spring")
     if shared:
-        arrays = {name: value for name, value in fit._asdict().items() if isinstance(value, np.ndarray)}
-        fit = fit._replace(**{name: np.repeat(value, n_columns, axis=0) for name, value in arrays.items()})
-    return fit._replace(warnings=warnings)
+        arrays = {name: value for name, value in found._asdict().items() if isinstance(value, np.ndarray)}
+        found = found._replace(
+            **{name: np.repeat(value, n_columns, axis=0) for name, value in arrays.items()}
+        )
+    return found._replace(warnings=warnings)
 
 
-def wire_length(x: Any, share: Any) -> Any:
+def wire_length(x: np.ndarray, share: float) -> np.ndarray:
     """Return the wire length, but for a factor, from x = w / w_max and share = I_comp w_max."""
-    xp = array_namespace(x, share)
-    return x / xp.maximum(1.0 - share * x, 1e-3)
+    return x / np.maximum(1.0 - share * x, 1e-3)
 
 
 def _held_out(
@@ -165,28 +158,46 @@ def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -
         each = [_robust_lines(x[:, [j]], y[:, [j]], share, False) for j in range(k)]
         columns = (np.concatenate(values) for values in list(zip(*each, strict=True))[:5])
         return _Lines(*columns, share=share, share_width=0.0)
-    # Pad the columns with missing rows, so that tables of several lengths share a compiled program.
-    n, y_centre, y_spread = len(x), np.nanmean(y, axis=0), np.maximum(np.nanstd(y, axis=0), 1e-300)
-    table = np.stack([x, (y - y_centre) / y_spread])
-    table = np.pad(table, ((0, 0), (0, -n % PADDED_ROWS), (0, 0)), constant_values=np.nan)
-    with jax.enable_x64(True):
-        found = jax.device_get(_minimise(*table, share, fit_share))
-    p, error, jacobian, numbers, change = found
-    # Take stretches of neighbouring rows as clusters: (n, ...) to (n_stretches, rows * columns, ...).
+    # Standardise the columns at the share of the start.
+    wire, y_centre, y_spread = wire_length(x, share), np.nanmean(y, axis=0), _spread(y)
+    wire = np.where(np.isfinite(y), wire, np.nan)
+    centre, spread, target = np.nanmean(wire, axis=0), _spread(wire), (y - y_centre) / y_spread
+    own = np.eye(k)
+
+    def model(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors and Jacobian by slopes (k,), offsets (k,) and, if fitted, the share's change."""
+        bent = wire_length(x, share + p[2 * k :].sum())
+        z = (bent - centre) / spread
+        by_share = (p[:k] * bent**2 / spread)[..., None]
+        jacobian = [z[..., None] * own, np.broadcast_to(own, (*z.shape, k)), by_share[..., : len(p) - 2 * k]]
+        return _stretches(p[:k] * z + p[k : 2 * k] - target), _stretches(np.concatenate(jacobian, axis=-1))
+
+    # Fit them; stretches of neighbouring rows are clusters.
+    n_parameters = 2 * k + fit_share
     problem = Problem(
-        prior=np.full(len(p), PRIOR),
-        group=np.tile(np.arange(k), -(-n // min(STRETCHES, n))),
+        prior=np.full(n_parameters, PRIOR),
+        group=np.tile(np.arange(k), -(-len(x) // min(STRETCHES, len(x)))),
         scale=np.ones(k),
         min_scale=np.full(k, 1e-9),
         huber=HUBER,
     )
-    solution = solution_at(p, _stretches(error[:n]), _stretches(jacobian[:n]), problem)
+    solution = fit(model, problem, ROUNDS, TOLERANCES)
+    # Slopes, offsets and the share of the columns as they are, and their derivatives by the parameters.
+    change = np.zeros((2 * k + 1, n_parameters))
+    change[:k, :k], change[k : 2 * k, :k] = np.diag(1.0 / spread), np.diag(-centre / spread)
+    change[k : 2 * k, k : 2 * k], change[2 * k :, 2 * k :] = own, 1.0
+    numbers = change @ solution.x
     width = STUDENT * np.sqrt(np.einsum("ip,pq,iq->i", change, solution.covariance, change))
     slope, offset, slope_width, offset_width = (
         y_spread * values for values in (numbers[:k], numbers[k : 2 * k], width[:k], width[k : 2 * k])
     )
-    noise, share_width = y_spread * solution.scale, float(width[-1])
-    return _Lines(slope, y_centre + offset, slope_width, offset_width, noise, float(numbers[-1]), share_width)
+    noise, share = y_spread * solution.scale, share + float(numbers[-1])
+    return _Lines(slope, y_centre + offset, slope_width, offset_width, noise, share, float(width[-1]))
+
+
+def _spread(values: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of each column (n, k), above zero."""
+    return np.maximum(np.nanstd(values, axis=0), 1e-300)
 
 
 def _stretches(table: np.ndarray) -> np.ndarray:
@@ -196,63 +207,6 @@ def _stretches(table: np.ndarray) -> np.ndarray:
     for row, piece in zip(padded, pieces, strict=True):
         row[: len(piece)] = piece
     return padded.reshape(len(pieces), -1, *table.shape[2:])
-
-
-@functools.partial(jax.jit, static_argnames="fit_share")
-def _minimise(x: Array, y: Array, share: Array, fit_share: bool) -> tuple[Array, ...]:
-    """Minimise Huber's loss over slopes and offsets of standardised columns and, if fitted, the share.
-
-    Args:
-        x, y (n, k): columns, NaN where missing; y has unit spread.
-        share (): share, or start of its fit.
-        fit_share: whether to fit the share.
-
-    Returns:
-        Parameters (p,); errors (n, k), NaN where missing; their Jacobian (n, k, p); slopes, offsets and share
-        of the columns as they are (2 k + 1,); their derivatives (2 k + 1, p).
-    """
-    known = jnp.isfinite(x) & jnp.isfinite(y)
-    n, k = known.sum(axis=0), x.shape[1]
-    x, y = jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)
-
-    def standardised(p: Array) -> tuple[Array, Array, Array]:
-        wire = wire_length(x, share + p[2 * k :].sum())
-        mean = jnp.sum(known * wire, axis=0) / n
-        spread = jnp.sqrt(jnp.maximum(jnp.sum(known * (wire - mean) ** 2, axis=0) / n, 1e-300))
-        return (wire - mean) / spread, mean, spread
-
-    def residual(p: Array) -> Array:
-        return jnp.where(known, p[:k] * standardised(p)[0] + p[k : 2 * k] - y, 0.0)
-
-    def numbers(p: Array) -> Array:
-        _, mean, spread = standardised(p)
-        slope = p[:k] / spread
-        return jnp.concatenate([slope, p[k : 2 * k] - slope * mean, share + p[2 * k :].sum(keepdims=True)])
-
-    def descend(p: Array, scale: Array) -> Array:
-        def loss(p: Array) -> Array:
-            huber = jnp.where(known, optax.losses.huber_loss(residual(p) / scale, delta=HUBER), 0.0)
-            return jnp.min(scale) ** 2 * jnp.sum(huber) / jnp.sum(n)
-
-        optimiser = optax.lbfgs(linesearch=optax.scale_by_backtracking_linesearch(20, store_grad=True))
-
-        def iterate(carry: tuple) -> tuple:
-            p, state, count, _ = carry
-            value, slope = optax.value_and_grad_from_state(loss)(p, state=state)
-            step, state = optimiser.update(slope, state, p, value=value, grad=slope, value_fn=loss)
-            return optax.apply_updates(p, step), state, count + 1, optax.tree.norm(slope)
-
-        start, goal = (p, optimiser.init(p), 0, jnp.inf), 1e-10 * jnp.min(scale)
-        return jax.lax.while_loop(lambda c: (c[2] < ITERATIONS) & (c[3] > goal), iterate, start)[0]
-
-    def next_round(count: Array, p: Array) -> Array:
-        size = jnp.nanmedian(jnp.where(known, jnp.abs(residual(p)), jnp.nan), axis=0)
-        return descend(p, jnp.where(count == 0, 1e3, jnp.maximum(SIGMA_PER_MEDIAN * size, 1e-9)))
-
-    # Least squares come first, then Huber's loss with the scale of the residuals of the round before.
-    p = jax.lax.fori_loop(0, ROUNDS, next_round, jnp.concatenate([jnp.ones(k), jnp.zeros(k + fit_share)]))
-    error = jnp.where(known, residual(p), jnp.nan)
-    return p, error, jax.jacfwd(residual)(p), numbers(p), jax.jacfwd(numbers)(p)
 
 
 def _warnings(fit: LineFit, wire: np.ndarray, name: str) -> tuple[str, ...]:

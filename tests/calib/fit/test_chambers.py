@@ -80,9 +80,7 @@ def test_arms_of_other_structure_come_back(name):
 
     Unknown directions, for which 80 poses are few, hardly move the tip.
     """
-    # Sections of one kind are two, which settle in half of the time
-    fewer = {} if name == "tapered" else {"n_sections": 2}
-    spec = OTHER_ARMS[name].replace(structure={"links_per_section": 2} | fewer)
+    spec = OTHER_ARMS[name].replace(structure={"links_per_section": 2})
     arm = planted(spec=spec)
     fit = calibrate_chambers(pose_log(arm, 80, seed=0), spec)
     _, area, slope, _ = off_by(fit.spec, arm)
