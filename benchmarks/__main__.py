@@ -41,6 +41,7 @@ BENCHMARKS = {
     "loads": "benchmarks.accuracy.loads:measure",
     "printed": "benchmarks.accuracy.printed:measure",
     "paper": "benchmarks.paper.experiments:Paper",
+    "confined": "benchmarks.accuracy.confined:measure",
     "traces": "benchmarks.paper.traces:measure",
 }
 

@@ -21,7 +21,7 @@ from benchmarks.paper.kinds import EVALUATION_FILE
 from mjx_softarm._support import cli, xla
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.mechanics.pipe import PIPES_MM
+from mjx_softarm.mechanics.pipe import PIPES
 from mjx_softarm.sensing.pose import quaternion_from_pose
 from mjx_softarm.spec import ArmSpec
 from train.demos.demonstrations import Demonstrations
@@ -169,8 +169,8 @@ def train(folder: Path, settings: PrintedSettings, name: str, seed: int) -> None
         command(log, "imitate", "--resume", str(run))
         return
     options = ["--preset", PRESETS[case.task], "--seed", str(seed), "--out", str(run)]
-    if diameter_mm := PIPES_MM.get(case.task):
-        options += ["--pipe", str(diameter_mm)]
+    if pipe := PIPES.get(case.task):
+        options += ["--pipe", f"{1e3 * pipe.diameter_m:g}"]
     if settings.env_steps:
         options += ["--learner.total-env-steps", str(settings.env_steps)]
     changes = [f"--{text.removesuffix('=true')}" for text in case.settings]  # a flag has no value

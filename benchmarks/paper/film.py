@@ -13,7 +13,7 @@ from benchmarks.paper.kinds import KINDS, Trial
 from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_tips, operate
 from benchmarks.paper.scene import Scene
 from mjx_softarm._support.files import replacing
-from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.mechanics.pipe import PIPES, CrossPipe
 
 WIDTH, HEIGHT = 240, 320  # of a picture [px]
 PERIOD_S = 1.0  # simulated time between two pictures
@@ -49,10 +49,13 @@ def film(path: Path, scene: Scene, trial: Trial) -> None:
 
 def _side(scene: Scene, trial: Trial) -> tuple[SideView, float]:
     """Return the pipe cut open from the front or the circle from above, and the gripper's length [m]."""
-    if diameter_mm := PIPES_MM.get(KINDS[trial.kind].task):
+    if pipe := PIPES.get(KINDS[trial.kind].task):
         gripper_m = scene.controller.policy.spec.mass.gripper_length_m
-        goals_mm, lines = 1e3 * finger_tips(scene.goals, gripper_m), outline_mm(CrossPipe.of_mm(diameter_mm))
-        title, text = f"twin {trial.twin}, {diameter_mm} mm pipe", "demonstrated (grey), finger tips"
+        goals_mm, lines = 1e3 * finger_tips(scene.goals, gripper_m), outline_mm(pipe)
+        title, text = (
+            f"twin {trial.twin}, {1e3 * pipe.diameter_m:g} mm pipe",
+            "demonstrated (grey), finger tips",
+        )
         return SideView(title, text, [0, 2], goals_mm, lines), gripper_m
     title, text = f"twin {trial.twin}, {KINDS[trial.kind].title}", "reference (grey) and tip, from above"
     return SideView(title, text, [0, 1], scene.goals[:, :3]), 0.0

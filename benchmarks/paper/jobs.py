@@ -16,7 +16,7 @@ from benchmarks.paper.engine import Settings, command, save_arrays
 from benchmarks.paper.kinds import KINDS, POLICY_FILE, Trial, arm_name, learned_run, reach_run
 from benchmarks.paper.measure import operate
 from benchmarks.paper.scene import CALIBRATION, demonstrations_path, scene_of, stand_in
-from mjx_softarm.mechanics.pipe import PIPES_MM
+from mjx_softarm.mechanics.pipe import PIPES
 from mjx_softarm.spec import ARM_FILE
 
 # Presets that differ in the payload alone: a run beside the experiment's own gets the same further settings.
@@ -99,7 +99,7 @@ def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
     file = folder / demonstrations_path(twin, task)
     part = file.with_name(f"part-{file.name}")  # a recording that ends early keeps its part
     part.unlink(missing_ok=True)
-    arm = f"twin:{twin}:{task}" if task in PIPES_MM else f"twin:{twin}"
+    arm = f"twin:{twin}:{task}" if task in PIPES else f"twin:{twin}"
     options = ["--arm", arm, "--task", task, "--calibration", str(file.parent / CALIBRATION)]
     command(file.with_suffix(".log"), "demos", "record", *options, "--out", str(part))
     os.replace(part, file)
@@ -119,8 +119,8 @@ def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> 
     # Start with the kind's options.
     options = ["--preset", kind.preset, "--seed", str(seed), "--out", str(run)]
     options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
-    if diameter_mm := PIPES_MM.get(kind.task):
-        options += ["--pipe", str(diameter_mm)]
+    if pipe := PIPES.get(kind.task):
+        options += ["--pipe", f"{1e3 * pipe.diameter_m:g}"]
     for option, source in (("--reward", kind.reward_of), ("--agent", kind.begins_with)):
         if source:
             options += [option, str(folder / learned_run(source, twin, seed))]

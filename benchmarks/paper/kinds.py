@@ -20,7 +20,7 @@ class Kind(NamedTuple):
 
 
 # The environment's reward in the place of the learned one, with hindsight; and both.
-_HAND_MADE = (
+HAND_MADE = (
     "learner.learned_weight=0",
     "learner.hand_made_weight=1",
     "learner.expert_share=0",
@@ -29,7 +29,7 @@ _HAND_MADE = (
     "learner.hindsight.reached_share=0.25",
     "learner.hindsight.near_share=0.5",
 )
-_BOTH = (*_HAND_MADE[1:], "learner.learned_weight=5")
+BOTH = (*HAND_MADE[1:], "learner.learned_weight=5")
 KINDS = {
     "specified": Kind("specification alone"),
     "without": Kind("calibrated springs"),
@@ -41,16 +41,16 @@ KINDS = {
     "gradient": Kind("gradient descent"),
     "pipe": Kind("learned reward", "pipe300", "pipe"),
     "moving": Kind("learned reward, in motion", "pipe300", "pipe-moving"),
-    "hand-made": Kind("hand-made reward", "pipe300", "pipe", _HAND_MADE),
-    "narrow": Kind("hand-made, and learned in the wide pipe", "pipe250", "pipe", _BOTH, reward_of="pipe"),
+    "hand-made": Kind("hand-made reward", "pipe300", "pipe", HAND_MADE),
+    "narrow": Kind("hand-made, and learned in the wide pipe", "pipe250", "pipe", BOTH, reward_of="pipe"),
     "narrow-learned": Kind(
         "learned in the wide pipe",
         "pipe250",
         "pipe",
-        (*_BOTH, "learner.hand_made_weight=0"),
+        (*BOTH, "learner.hand_made_weight=0"),
         reward_of="pipe",
     ),
-    "narrow-hand-made": Kind("hand-made reward", "pipe250", "pipe", _HAND_MADE),
+    "narrow-hand-made": Kind("hand-made reward", "pipe250", "pipe", HAND_MADE),
     "circle": Kind("with demonstrations", "circle16", "circle", begins_with="quick"),
 }
 TASKS = ("pipe300", "pipe250", "circle16")

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.paper.engine import Settings
 from benchmarks.paper.kinds import KINDS, POLICY_FILE, Trial, reach_run, run_of
-from mjx_softarm.mechanics.pipe import PIPES_MM
+from mjx_softarm.mechanics.pipe import PIPES
 
 CALIBRATION = "calibration"  # folder of a twin's calibration
 # Session of a twin in trials of demonstrated tasks. Demonstrations are recorded in its evaluation session,
@@ -43,7 +43,6 @@ def stand_in(settings: Settings) -> Any:
 def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
     """Return the scene of a trial."""
     from mjx_softarm.mechanics.excitation import circle_poses
-    from mjx_softarm.mechanics.pipe import CrossPipe
     from mjx_softarm.twin.instruments import EVALUATION_SESSION
     from train.demos.demonstrations import load_demonstrations
     from train.demos.waypoints import task as task_of
@@ -51,8 +50,8 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
     controller, task = controller_of(folder, trial), KINDS[trial.kind].task
     # The goals: demonstrated positions of a pipe's task, or points of the circle.
     inside: dict[str, Any] = {}
-    if task in PIPES_MM:
-        spec, inside = controller.policy.spec, {"pipe": CrossPipe.of_mm(PIPES_MM[task])}
+    if task in PIPES:
+        spec, inside = controller.policy.spec, {"pipe": PIPES[task]}
         demonstrations = load_demonstrations(folder / demonstrations_path(trial.twin, task), spec)
         goals = demonstrations.positions[: settings.n_positions].astype(float)
         names = [waypoint.name for waypoint in task_of(task, spec)[0][: settings.n_positions]]

@@ -19,7 +19,6 @@ from mjx_softarm.spec import ArmSpec
 # Objects that the arm picks and places. Source: the paper's section on confined scenarios.
 BALL_KG = 0.035  # a sponge ball
 APPLE_KG = 0.220
-PIPES_MM = {"pipe300": 300, "pipe250": 250}  # diameters
 LIP_HALF_M = 0.005  # half the thickness of a lip, whose edge is round
 RIM_BALLS, RIM_BALL_M = 8, 0.01  # balls that stand for a ring near the tip, and their radius
 RIM_POINTS = 16  # points of a ring; its rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
@@ -63,6 +62,15 @@ class CrossPipe:
             "right": np.array([far, 0.0, side_z]),
             "bottom": np.array([0.0, 0.0, self.centre_z_m - far]),
         }
+
+
+PIPES = {
+    "pipe300": CrossPipe.of_mm(300.0),
+    "pipe250": CrossPipe.of_mm(250.0),
+    "pipe200": CrossPipe.of_mm(200.0),
+    "lip300": CrossPipe.of_mm(300.0, lip_mm=80.0),
+    "lip250": CrossPipe.of_mm(250.0, lip_mm=80.0),
+}
 
 
 @dataclass(frozen=True)

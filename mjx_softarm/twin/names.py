@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.mechanics.pipe import PIPES
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import AGED, AS_BUILT, EXACT
@@ -34,9 +34,11 @@ def twin_of(name: str) -> Twin | RodTwin:
         return RodTwin(number, spec, payload_kg, build=build)
     rest, colon, pipe = name.partition(":")
     number, spec = _seed_and_arm(rest, "twin:SEED")
-    if colon and pipe not in PIPES_MM:
-        raise ValueError(f"twin:{rest}:PIPE: got {pipe!r}, expected {' or '.join(PIPES_MM)}, or grams, 500g")
-    return Twin(number, spec, payload_kg, build=build, pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
+    if colon and pipe not in PIPES:
+        raise ValueError(
+            f"twin:{rest}:PIPE: got {pipe!r}, expected one of {', '.join(PIPES)}, or grams, 500g"
+        )
+    return Twin(number, spec, payload_kg, build=build, pipe=PIPES[pipe] if pipe else None)
 
 
 def _without_payload(name: str) -> tuple[str, float]:

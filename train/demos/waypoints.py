@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.mechanics.pipe import PIPES, CrossPipe
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 
@@ -35,7 +35,13 @@ class Waypoint(NamedTuple):
 # Stops of a path, each with the number of moves to it; the path begins at "home".
 _PIPE300 = (("pick right", 4), ("place left", 7), ("pick bottom", 6), ("place right", 6), ("home", 4))
 _PIPE250 = (("pick left", 6), ("place bottom", 8), ("pick right", 8), ("place left", 8), ("home", 6))
-_STOPS = {"pipe300": _PIPE300, "pipe250": _PIPE250}
+_STOPS = {
+    "pipe300": _PIPE300,
+    "pipe250": _PIPE250,
+    "pipe200": _PIPE250,
+    "lip300": _PIPE300,
+    "lip250": _PIPE250,
+}
 TASKS = ("circle16", *_STOPS)
 
 
@@ -43,7 +49,7 @@ def task(name: str, spec: ArmSpec) -> tuple[tuple[Waypoint, ...], CrossPipe | No
     """Return the waypoints of one of `TASKS` for an arm with the gripper of `spec`, and its pipe."""
     if name == "circle16":
         return circle(16, spec), None
-    pipe = CrossPipe.of_mm(PIPES_MM[name])
+    pipe = PIPES[name]
     return pick_and_place(pipe, _STOPS[name]), pipe
 
 

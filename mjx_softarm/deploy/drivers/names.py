@@ -4,7 +4,8 @@
     wiring.toml            hardware by its settings (`mjx_softarm.deploy.drivers.wiring`)
     twin:SEED              a twin; `twin:rod:SEED` is a rod; `twin:SEED@ARM` has another arm, as for `--spec`
 
-Options follow a twin's name, in this order: `:pipe300` or `:pipe250` puts it into a pipe. `:aged` is the same
+Options follow a twin's name, in this order: `:pipe300`, or another name of
+`mjx_softarm.mechanics.pipe.PIPES`, puts it into a pipe. `:aged` is the same
 arm some months later: each spring's zero is 1 mm off, and the chambers are 5 % softer. `:exact` has all parts
 as specified, with friction, hysteresis and noise. `:lost4` takes the pressure of chamber 4. `:500g` hangs a
 payload of 500 g to it.
