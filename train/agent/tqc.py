@@ -20,7 +20,7 @@ from jax import Array
 
 from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
-from train.agent import prior
+from train.agent import networks, prior
 from train.agent.hindsight import HindsightConfig, relabel
 from train.agent.learner import (
     Experience,
@@ -32,16 +32,6 @@ from train.agent.learner import (
     check_settings,
 )
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
-from train.agent.networks import (
-    Actor,
-    Critics,
-    check_same_shapes,
-    descend,
-    given_actor,
-    mode,
-    own_buffers,
-    squash,
-)
 from train.agent.prediction import PredictiveCritics, Predictor
 
 Params = Any  # a flax parameter tree
@@ -109,8 +99,8 @@ class TQCState(NamedTuple):
 
 
 # Fields of the state by the names of the parts that another run may begin with, beside the policy.
-_NETWORKS = {"actor": "actor_params", "critics": "critic_params", "targets": "target_params"}
-_NETWORKS |= {"log_alpha": "log_alpha"}
+_PARTS = {"actor": "actor_params", "critics": "critic_params", "targets": "target_params"}
+_PARTS |= {"log_alpha": "log_alpha"}
 
 
 class TQC:
@@ -118,8 +108,8 @@ class TQC:
 
     def __init__(self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig()) -> None:
         self.obs_size, self.action_size, self.config = obs_size, action_size, config
-        self.actor: Any = Actor(action_size, config.hidden, config.activation)
-        self.critics: Any = Critics(
+        self.actor: Any = networks.Actor(action_size, config.hidden, config.activation)
+        self.critics: Any = networks.Critics(
             config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
         )
         if config.n_ahead:
@@ -143,40 +133,41 @@ class TQC:
         log_alpha = jnp.log(jnp.asarray(self.config.initial_alpha, obs.dtype))
         return TQCState(
             actor_params=actor_params,
-            mean_actor_params=own_buffers(actor_params),
+            mean_actor_params=networks.own_buffers(actor_params),
             critic_params=critic_params,
-            target_params=own_buffers(critic_params),
+            target_params=networks.own_buffers(critic_params),
             log_alpha=log_alpha,
             actor_opt_state=self.actor_optimizer.init(actor_params),
             critic_opt_state=self.optimizer.init(critic_params),
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
-            given_params=own_buffers(actor_params) if self.config.from_policy else None,
+            given_params=networks.own_buffers(actor_params) if self.config.from_policy else None,
         )
 
     def parts(self, state: TQCState) -> dict[str, Params]:
         """Return the networks and the temperature."""
-        networks = {name: getattr(state, field) for name, field in _NETWORKS.items()}
-        return {"policy": state.mean_actor_params, **networks}
+        return {"policy": state.mean_actor_params} | {name: getattr(state, f) for name, f in _PARTS.items()}
 
     def adopt(self, state: TQCState, parts: Mapping[str, Params]) -> TQCState:
         """Return the state with another run's networks and temperature; the optimisers begin anew."""
         if "critics" not in parts:
             raise ValueError("got a policy without critics, expected a run of TQC")
-        given = {"mean_actor_params": parts["policy"], **{f: parts[n] for n, f in _NETWORKS.items()}}
-        check_same_shapes("networks", given, {name: getattr(state, name) for name in given})
+        given = {"mean_actor_params": parts["policy"], **{f: parts[n] for n, f in _PARTS.items()}}
+        networks.check_same_shapes("networks", given, {name: getattr(state, name) for name in given})
         return state._replace(**given)
 
     def adopt_policy(self, state: TQCState, given: Params) -> TQCState:
         """Return the state with a given actor's means and little exploration; it may observe less."""
-        actor = given_actor(given, self.obs_size, self.action_size)
-        check_same_shapes("actor", actor, state.actor_params)
-        given = own_buffers(actor) if self.config.from_policy else None
-        return state._replace(actor_params=actor, mean_actor_params=own_buffers(actor), given_params=given)
+        actor = networks.given_actor(given, self.obs_size, self.action_size)
+        networks.check_same_shapes("actor", actor, state.actor_params)
+        given = networks.own_buffers(actor) if self.config.from_policy else None
+        return state._replace(
+            actor_params=actor, mean_actor_params=networks.own_buffers(actor), given_params=given
+        )
 
     def act(self, state: TQCState, obs: Array, key: Array) -> Array:
         """Sample an action (..., A) in (-1, 1) at obs (..., O)."""
         mean, log_std = self.actor.apply(state.actor_params, obs)
-        return squash(mean, log_std, draws.normal(key, mean.shape))[0]
+        return networks.squash(mean, log_std, draws.normal(key, mean.shape))[0]
 
     def policy(self, state: TQCState) -> Params:
         """Return the parameters of the mean actor."""
@@ -184,7 +175,7 @@ class TQC:
 
     def mode(self, policy: Params, obs: Array) -> Array:
         """Return the deterministic action (..., A) in (-1, 1) at obs (..., O)."""
-        return mode(self.actor.apply(policy, obs)[0])
+        return networks.mode(self.actor.apply(policy, obs)[0])
 
     def update(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
         """Take one gradient step of critics, actor and temperature, then average critics and actor.
@@ -210,10 +201,10 @@ class TQC:
         loss_alpha, d_alpha = jax.value_and_grad(alpha_loss)(state.log_alpha, log_prob, self.target_entropy)
 
         # Optimiser steps, and Polyak averages of their results.
-        critic = descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
-        actor = descend(self.actor_optimizer, d_actor, state.actor_opt_state, state.actor_params)
-        temperature = descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
-        next_state = TQCState(
+        critic = networks.descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
+        actor = networks.descend(self.actor_optimizer, d_actor, state.actor_opt_state, state.actor_params)
+        temperature = networks.descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
+        next_state = state._replace(
             actor_params=actor[0],
             mean_actor_params=optax.incremental_update(actor[0], state.mean_actor_params, self.config.tau),
             critic_params=critic[0],
@@ -222,7 +213,6 @@ class TQC:
             actor_opt_state=actor[1],
             critic_opt_state=critic[1],
             alpha_opt_state=temperature[1],
-            given_params=state.given_params,
         )
         losses = {"actor_loss": loss_actor, "alpha_loss": loss_alpha, **critic_metrics}
         means = {"entropy": -jnp.mean(log_prob), "target_mean": jnp.mean(targets)}
@@ -230,7 +220,7 @@ class TQC:
 
     def _targets(self, state: TQCState, batch: Transition, noise: Array) -> Array:
         next_actor = self.actor.apply(state.actor_params, batch.next_obs)
-        next_action, next_log_prob = squash(*next_actor, noise=noise)  # (B, A), (B,)
+        next_action, next_log_prob = networks.squash(*next_actor, noise=noise)  # (B, A), (B,)
         return truncated_targets(
             self.critics.apply(state.target_params, batch.next_obs, next_action),  # (B, C, M)
             next_log_prob,
@@ -251,7 +241,7 @@ class TQC:
         return loss, metrics
 
     def _actor_loss(self, params: Params, state: TQCState, obs: Array, noise: Array) -> tuple[Array, Array]:
-        action, log_prob = squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
+        action, log_prob = networks.squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
         quantiles = self.critics.apply(state.critic_params, obs, action)  # (B, C, M)
         loss = actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha))
         if state.given_params is not None:
