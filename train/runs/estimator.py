@@ -54,6 +54,9 @@ WIDTH = 128  # width of the hidden layers
 N_DRAWS = 4  # of what a calibration leaves unknown, for each pose
 SD_WIDTH = 32  # width of those of the payload's error
 SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
+# Schedules for which the payload's network learns: on twin 0 it is then within 48 g (RMS) of generalised
+# least squares, after one within 68 g.
+LOAD_SCHEDULES = 3
 PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
@@ -125,7 +128,8 @@ def fit_load_estimator(
 ) -> LoadEstimator:
     """Return the payload network of an arm, learned from `loaded_poses`; arguments as of `distil`."""
     keys = _keys(seed)
-    learned = _fit(_first_load_estimator(spec, loaded, keys[3]), _load_loss, loaded, keys[4])
+    first = _first_load_estimator(spec, loaded, keys[3])
+    learned = _fit(first, _load_loss, loaded, keys[4], n_schedules=LOAD_SCHEDULES)
     # The error is learned from poses that the load network does not know, on which it is larger.
     others = loaded_poses(spec, held, N_JUDGING, seed + 1)
     return _fit(learned, _load_sd_loss, others, jax.random.fold_in(keys[4], 1), "sd_layers")
@@ -250,14 +254,20 @@ def _spring_loss(model: SpringModel, pool: Pool) -> Array:
 
 
 def _fit(
-    network: Any, loss: Callable[[Any, Any], Array], pool: Any, key: Array, layers: str = "layers"
+    network: Any,
+    loss: Callable[[Any, Any], Array],
+    pool: Any,
+    key: Array,
+    layers: str = "layers",
+    n_schedules: int = 1,
 ) -> Any:
     """Return the network with its field `layers` trained; its other fields stay."""
+    schedule = SCHEDULE._replace(n_updates=n_schedules * SCHEDULE.n_updates)
 
     def loss_of(weights: Any, rows: Any) -> Array:
         return loss(network._replace(**{layers: weights}), rows)
 
-    weights, _ = train_network(loss_of, getattr(network, layers), pool, SCHEDULE, key)
+    weights, _ = train_network(loss_of, getattr(network, layers), pool, schedule, key)
     return network._replace(**{layers: weights})
 
 
