@@ -42,7 +42,7 @@ N_FRAMES = 50  # averaged frames of a logged pose: a second
 FIRST, MORE_SEED, MOVING_SEED = 500, 1_000, 2_000  # random poses of all; seeds of other poses, plus the rod's
 RECORDINGS = {"random": "500 random", "planned": "500 random, 200 planned", "more": "700 random"}
 N_MORE = 200
-GRID_POINTS = 20  # goals of the grid, at most
+GRID_POINTS = 60  # goals of the grid, at most; 20 leave four on the rods
 CIRCLE_MM = {0: 1.5, 500: 1.5, 1000: 2.0}  # targets by payload [g]: mean error on the circle
 BELIEVED_MM, PAYLOAD_G, HALF, QUARTER_OFF = 0.5, 60.0, 0.5, 0.75  # other targets
 
