@@ -24,7 +24,6 @@ BENCHMARKS = {
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",
     "changes": "benchmarks.accuracy.changes:measure",
-    "transfer": "benchmarks.accuracy.transfer:measure",
     "correction": "benchmarks.accuracy.correction:measure",
     "pose-error": "benchmarks.accuracy.correction:pose_error",
     "planning": "benchmarks.accuracy.planning:measure",
