@@ -150,8 +150,13 @@ class EnvConfig:
         # Pipe
         for name in ("clearance_cost_per_mm", "pipe_lip_mm", "pipe_contact"):
             without = self.pipe_diameter_mm is not None or not getattr(self, name)
-            _expect(self, name, without, "0 without a pipe_diameter_mm")
+            _expect(self, name, without, f"{type(getattr(self, name))()!r} without a pipe_diameter_mm")
         other_engine = self.moves and self.engine != "chain"
-        _expect(self, "pipe_contact", not (self.pipe_contact and other_engine), "false with this engine")
+        _expect(
+            self,
+            "pipe_contact",
+            not (self.pipe_contact and other_engine),
+            f"False with the engine {self.engine!r} in motion",
+        )
         if self.pipe_diameter_mm is not None:
             CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)  # raises ValueError
