@@ -12,7 +12,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import TOLERANCE_M
 from mjx_softarm.mdp.observation import Observation
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.mechanics.pipe import Contact, CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.spec import ArmSpec
 
@@ -88,6 +88,10 @@ class EnvConfig:
         if self.pipe_diameter_mm is None:
             return None
         return CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)
+
+    def contact(self, spec: ArmSpec) -> Contact | None:
+        """Return the contact of an arm with the pipe, if its wall acts."""
+        return Contact.of(self.pipe, spec) if self.pipe and self.pipe_contact else None
 
     @property
     def moves(self) -> bool:

@@ -25,7 +25,6 @@ from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.motion import midpoint, mjx_step
 from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
-from mjx_softarm.mechanics.pipe import Contact
 from mjx_softarm.mechanics.settle import Settled, SettleResult, arms_at_once, settle
 from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.sensing.pose import pose_from_frame
@@ -79,10 +78,8 @@ class ReachEnv:
         self.episode_motion = EpisodeMotion(self.spec, self.config)
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
-        pipe = self.config.pipe
-        if pipe is not None and self.config.pipe_contact:
-            self.params = self.params._replace(contact=Contact.of(pipe, self.spec))
-        self.walls = Walls(pipe, self.spec, self.params, s2r)
+        self.params = self.params._replace(contact=self.config.contact(self.spec))
+        self.walls = Walls(self.config.pipe, self.spec, self.params, s2r)
 
         # Simulation, and the poses that starts and goals are drawn from
         self.uses_mjx = self.config.engine != "chain" or self.config.moves
