@@ -92,7 +92,7 @@ def fit_network(
 
 def _loss(layers: tuple[Layer, ...], rows: tuple[Array, Array]) -> Array:
     x, y = rows
-    return jnp.mean((mlp(layers, x) - y) ** 2)
+    return jnp.mean((mlp(layers, x, "relu") - y) ** 2)
 
 
 def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:

@@ -25,7 +25,7 @@ def activate(x: Array, activation: Activation) -> Array:
     return 0.5 * x * (1.0 + xp.tanh(2.0 * x))  # tanh does not overflow
 
 
-def mlp(layers: Sequence[Layer], x: Array, activation: Activation = "relu") -> Array:
+def mlp(layers: Sequence[Layer], x: Array, activation: Activation = "swish") -> Array:
     """Return outputs (..., out) of inputs (..., in); the output layer is linear."""
     *hidden, (head_weight, head_bias) = layers
     for weight, bias in hidden:

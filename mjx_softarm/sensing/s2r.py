@@ -77,7 +77,7 @@ def correction(s2r: S2R, x: Array) -> Array:
     """Return the corrections (..., n_out) of inputs (..., n_in), within the range of the training rows."""
     xp = array_namespace(x, s2r.input_low)
     z = xp.clip(_normalised(s2r, x), -1.0, 1.0)
-    return xp.clip(mlp(s2r.layers, z), s2r.output_low, s2r.output_high)
+    return xp.clip(mlp(s2r.layers, z, "relu"), s2r.output_low, s2r.output_high)
 
 
 def distance(s2r: S2R, x: Array) -> Array:
