@@ -16,6 +16,7 @@ from train.config import TrainConfig
 
 # Settings that made learning faster or finer.
 _TUNED = TQCConfig(
+    activation="swish",
     gamma=0.5,
     learning_rate=1e-3,
     learning_rate_end=0.02,

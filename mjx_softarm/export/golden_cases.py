@@ -29,7 +29,7 @@ _OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows with a goal outside, and wit
 _LAG, _NOISE_M = 0.15, 4e-5  # share of the way to the commanded pressure per tick; noise of lengths
 _SWING_M, _SHAKE_M = 2e-3, 1e-3  # amplitudes of springs that never rest
 _CANDIDATES = 200  # number of goals from which the checked goals are chosen
-_REACHED, _MISSED = 0.8, 1.5  # errors of clearly reached and clearly missed goals, over the threshold
+_REACHED, _MISSED = 0.5, 1.5  # errors of clearly reached and clearly missed goals, over the threshold
 _SHIFT = 0.01  # shift [mm, deg] under which these errors must stay clear, since a search has rounding errors
 _RUNS = ("calm", "lost", "stuck", "late", "leaking", "unplugged", "swinging", "heavy", "pressed", "dropping")
 _RUNS += ("shaken",)  # springs shake and a chamber leaks, so that it is lost in motion
@@ -115,7 +115,7 @@ def _checked_rows(controller: Controller, rng: np.random.Generator) -> Iterator[
     goals = rng.choice(policy.workspace, _CANDIDATES)
     goals = goals + rng.normal(0.0, [5.0] * 3 + [30.0] * 3, goals.shape)
     goals = goals[[nearest(controller.reachable, goal)[1] < 0.98 for goal in goals]]
-    errors = np.array([nearest_poses(policy, goals + shift)[1] for shift in (0.0, _SHIFT)])
+    errors = np.array([nearest_poses(policy, goals + shift)[1] for shift in (-_SHIFT, 0.0, _SHIFT)])
     least, most = errors.min(axis=0) / policy.reward.threshold, errors.max(axis=0) / policy.reward.threshold
     readings = policy.sensor.readings(expected_springs(policy.spring_model, np.zeros(n)))
     for chosen in (least > _MISSED, most < _REACHED):
