@@ -55,7 +55,7 @@ class AnalyticConfig(LearnerConfig):
     hidden: tuple[int, ...] = (256, 256, 256, 256)  # widths of the policy's hidden layers
     activation: Activation = "swish"  # function after each of them
     n_arms: int = 64  # arms of a gradient step
-    total_env_steps: int = 64 * 98_304  # actions of all arms together; each arm takes one per gradient step
+    total_env_steps: int = 64 * 49_152  # actions of all arms together; each arm takes one per gradient step
     vector_steps_per_epoch: int = 256  # gradient steps between two reports
     learning_rate: float = 2e-3  # learning rate at first (Adam)
     learning_rate_half: float = 3_000.0  # gradient steps t_half of the rate's decay, 1 / (1 + t / t_half)
