@@ -44,10 +44,9 @@ class CalibratedArm(NamedTuple):
         Raises:
             SealedFileError: a file cannot be written.
         """
-        for name, model, save in (
-            (S2R_FILE, self.s2r, save_s2r),
-            (PRESSURES_FILE, self.held, save_pressures),
-        ):
+        for name in (S2R_FILE, PRESSURES_FILE):
             (folder / name).unlink(missing_ok=True)
-            if model is not None:
-                save(folder / name, model)
+        if self.s2r is not None:
+            save_s2r(folder / S2R_FILE, self.s2r)
+        if self.held is not None:
+            save_pressures(folder / PRESSURES_FILE, self.held)

@@ -90,8 +90,8 @@ def claim(folder: Path, settings: Settings) -> None:
         raise JobError(f"{file}: {differing}; choose another --out")
 
 
-def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[WorkStage]]) -> dict[str, Any]:
-    """Run the stages that are not done, group by group.
+def run_stages(folder: Path, settings: Any, groups: Sequence[Sequence[WorkStage]]) -> dict[str, Any]:
+    """Run the stages that are not done, group by group; each function takes folder, settings and its inputs.
 
     Returns:
         Results of the functions that ran, by the name of the stage.

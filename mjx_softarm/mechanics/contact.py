@@ -93,8 +93,8 @@ def wall_terms(contact: Contact, frames: Frames) -> tuple[Array, Array, Array]:
     gradient = jnp.sum(twist * below[0][:, :, None], axis=0)  # (L, 3 dofs, *arms)
     change = sum(twist[i] * below[1 + i][:, :, None] for i in range(6))  # (6, L, 3 dofs, *arms)
     nv, arms = gradient.shape[0] * gradient.shape[1], gradient.shape[2:]
-    factors = (jnp.moveaxis(x, 0, 2).reshape(nv, 6, *arms) for x in (twist, change))
-    return gradient.reshape(nv, *arms), *factors
+    twist, change = (jnp.moveaxis(x, 0, 2).reshape(nv, 6, *arms) for x in (twist, change))
+    return gradient.reshape(nv, *arms), twist, change
 
 
 def step_share(contact: Contact, before: Frames, after: Frames) -> Array:

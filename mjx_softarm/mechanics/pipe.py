@@ -94,9 +94,8 @@ class Contact:
             radius += [ring_m[k] if is_ball[k] else RIM_BALL_M] * len(balls)
         corners = _lower_corners(spec)
         plate += [spec.n_links] * len(corners)
-        return cls(
-            pipe, *map(tuple, (plate, map(tuple, [*centre, *corners]), [*radius, *[0.0] * len(corners)]))
-        )
+        centre_m = tuple((x, y, z) for x, y, z in [*centre, *corners])
+        return cls(pipe, tuple(plate), centre_m, (*radius, *[0.0] * len(corners)))
 
 
 def _lower_corners(spec: ArmSpec) -> list[list[float]]:
