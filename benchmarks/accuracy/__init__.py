@@ -1,1 +1,1 @@
-"""Accuracy of calibration and of trained policies."""
+"""Accuracy of trained policies."""

@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import changes, correction
+from benchmarks.accuracy import correction
+from benchmarks.calibration import changes
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy import session
 from mjx_softarm.deploy.accuracy.measure import figures, measure

@@ -1,6 +1,6 @@
 """Policies of rods by the poses of their calibration: the targets."""
 
-from benchmarks.accuracy.planning import CIRCLE_MM, RECORDINGS, targets
+from benchmarks.calibration.planning import CIRCLE_MM, RECORDINGS, targets
 
 
 def rows(name, off_g, grid_mm, unknown):

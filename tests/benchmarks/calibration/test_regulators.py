@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.accuracy import regulators
+from benchmarks.calibration import regulators
 
 DATA = Path(__file__).parents[3].parent / "shared/data"
 

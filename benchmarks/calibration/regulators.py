@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.accuracy.logs import ASU_LOGS, read_asu
+from benchmarks.calibration.logs import ASU_LOGS, read_asu
 from benchmarks.harness.common import target
 from calib.fit.motion.actuators import fit_regulator
 from calib.fit.motion.tracks import Runs, Track

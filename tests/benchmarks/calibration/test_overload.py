@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import overload
+from benchmarks.calibration import overload
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.ending import Ending, LoopRun
 from mjx_softarm.deploy.safety import Event, Fault

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.accuracy.payload import PAYLOADS_G, hold, targets
+from benchmarks.calibration.payload import PAYLOADS_G, hold, targets
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.payload import payload_poses, told_payload
 from mjx_softarm import ArmSpec

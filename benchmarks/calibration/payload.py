@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.accuracy.planning import log_at_rest
+from benchmarks.calibration.planning import log_at_rest
 from benchmarks.harness.common import target
 from calib import steps
 from calib.fit.held_pressures import fit_held_pressures

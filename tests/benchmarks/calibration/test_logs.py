@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import logs
-from benchmarks.accuracy.logs import read_asu, read_trunk
+from benchmarks.calibration import logs
+from benchmarks.calibration.logs import read_asu, read_trunk
 from mjx_softarm.logs import checks
 from mjx_softarm.logs.checks import LogError
 
