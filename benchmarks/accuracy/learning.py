@@ -29,12 +29,12 @@ class FigureTarget(NamedTuple):
 TWELVE = "evaluation-in-motion-12x0.5s_over_seeds"  # twelve actions of half a second
 TARGETS = {  # of presets
     "analytic": (
-        FigureTarget("median_mm", 0.5),
-        FigureTarget("p95_mm", 1.5),
+        FigureTarget("median_mm", 0.45),
+        FigureTarget("p95_mm", 1.2),
         FigureTarget("reached_share", 0.98, at_least=True),
-        FigureTarget("circle_mean_mm", 0.4),
-        FigureTarget("even_median_mm", 0.8),
-        FigureTarget("even_p95_mm", 4.0),
+        FigureTarget("circle_mean_mm", 0.35),
+        FigureTarget("even_median_mm", 0.6),
+        FigureTarget("even_p95_mm", 3.0),
     ),
     "quick": (FigureTarget("median_mm", 1.5),),
     "motion": (
