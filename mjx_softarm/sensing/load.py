@@ -7,6 +7,9 @@ calibration leaves unknown. A second network gives the standard deviation of the
 
 A payload changes rarely, so estimates are averaged, until two in a row disagree with the average. Errors of
 neighbouring poses are alike, so an average counts as no more certain than its estimates.
+
+Both networks have ReLU. Smooth ones are 5 to 15 % better at held-out poses, but told 124 instead of 78 g
+around the circle of an empty twin.
 """
 
 from __future__ import annotations
@@ -58,13 +61,16 @@ def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array
 
     Its springs have lengths (..., n_springs) [m], its chambers pressures (..., n_chambers) [kPa].
     """
-    return estimator.load_scale_kg * mlp(estimator.layers, _inputs(estimator, spring_m, pressure_kpa))[..., 0]
+    return (
+        estimator.load_scale_kg
+        * mlp(estimator.layers, _inputs(estimator, spring_m, pressure_kpa), "relu")[..., 0]
+    )
 
 
 def load_half_width(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
     """Return the half-width (...) [kg] of the 95 % interval of `estimate_load`, with the same arguments."""
     xp = array_namespace(spring_m, pressure_kpa, estimator.load_scale_kg)
-    share = xp.exp(mlp(estimator.sd_layers, _inputs(estimator, spring_m, pressure_kpa))[..., 0])
+    share = xp.exp(mlp(estimator.sd_layers, _inputs(estimator, spring_m, pressure_kpa), "relu")[..., 0])
     return QUANTILE * estimator.load_scale_kg * xp.clip(share, LEAST_SHARE, MOST_SHARE)
 
 
