@@ -88,8 +88,9 @@ def _read(file: Path, key: str, spec: ArmSpec) -> tuple[tuple[Any, Any, Any], di
 def _key(spec: ArmSpec, held: HeldPressures | None) -> str:
     """Return a checksum of the arm with its residual pressures, of the networks' settings, JAX and the code.
 
-    The code is `train/runs/estimator.py`, `mjx_softarm/spec.py` and the modules of `_support`, `mechanics`
-    and `sensing`, without subfolders. Versions of other packages, and the device, are not part of it.
+    The code is `estimator.py` and `first_networks.py` beside this file, `mjx_softarm/spec.py` and the modules
+    of `_support`, `mechanics` and `sensing`, without subfolders. Versions of other packages, and the device,
+    are not part of it.
     """
     settings = [spec.to_dict(), SEED, estimator.N_TRAINING, estimator.N_HELD_OUT, estimator.SCHEDULE]
     digest = hashlib.sha256(json.dumps([*settings, estimator.PAYLOADS, jax.__version__]).encode())
@@ -99,7 +100,7 @@ def _key(spec: ArmSpec, held: HeldPressures | None) -> str:
     folders = (package / name for name in ("_support", "mechanics", "sensing"))
     for source in (
         package / "spec.py",
-        Path(estimator.__file__),
+        *(Path(__file__).with_name(name) for name in ("estimator.py", "first_networks.py")),
         *(f for d in folders for f in d.glob("*.py")),
     ):
         digest.update(source.read_bytes())

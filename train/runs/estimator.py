@@ -18,8 +18,7 @@ import numpy as np
 from jax import Array
 
 from calib.fit.s2r import simulate_poses
-from mjx_softarm._support.training import Schedule, initial_layers, train_network
-from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm._support.training import Schedule, train_network
 from mjx_softarm.mechanics.workspace import (
     CANDIDATES_PER_POSE,
     HELD_OUT_SEED,
@@ -30,7 +29,6 @@ from mjx_softarm.mechanics.workspace import (
 )
 from mjx_softarm.posture import hangs
 from mjx_softarm.sensing.estimator import (
-    N_CHANGES,
     PoseEstimator,
     SpringModel,
     estimate_frame,
@@ -47,12 +45,11 @@ from mjx_softarm.sensing.load import (
 )
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
+from train.runs.first_networks import first_estimator, first_load_estimator, first_spring_model
 
 N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 4_096, 2_048
 MORE_PRESSURE = 0.25  # share of the pressure range that is added at either end
-WIDTH = 128  # width of the hidden layers
 N_DRAWS = 4  # of what a calibration leaves unknown, for each pose
-SD_WIDTH = 32  # width of those of the payload's error
 SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
 # Schedules for which the payload's network learns: on twin 0 it is then within 48 g (RMS) of generalised
 # least squares, after one within 68 g.
@@ -60,7 +57,6 @@ LOAD_SCHEDULES = 3
 PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
-CHANGE_SCALE = 0.015  # scale of the network's outputs, in mean section lengths and half radians
 
 
 class Error(NamedTuple):
@@ -100,12 +96,12 @@ def distil(spec: ArmSpec, seed: int, held: HeldPressures | None = None) -> Disti
     load_kg = jnp.full(len(pool.pose), spec.mass.payload_kg)
     poses = LoadedPool(load_kg, pool.pressure_kpa, pool.spring_m, pool.pose)
     loaded = loaded_poses(spec, held, N_TRAINING, seed)
-    estimator = _fit(_first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
+    estimator = _fit(first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
     estimator = _fit(estimator, _pose_loss, loaded, keys[2], "load_layers")
     # Learn the load of arms that are off, and the springs of the unloaded arm.
     load_estimator = fit_load_estimator(spec, held, loaded, seed)
     unloaded = _as_measured(spec, held, sample_workspace(spec, N_TRAINING, seed))
-    springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
+    springs = _fit(first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
     # Test them.
     learned = Distilled(estimator, load_estimator, springs, {})
     learned = jax.tree.map(lambda x: np.asarray(x, np.float32), learned)
@@ -128,7 +124,7 @@ def fit_load_estimator(
 ) -> LoadEstimator:
     """Return the payload network of an arm, learned from `loaded_poses`; arguments as of `distil`."""
     keys = _keys(seed)
-    first = _first_load_estimator(spec, loaded, keys[3])
+    first = first_load_estimator(spec, loaded, keys[3])
     learned = _fit(first, _load_loss, loaded, keys[4], n_schedules=LOAD_SCHEDULES)
     # The error is learned from poses that the load network does not know, on which it is larger.
     others = loaded_poses(spec, held, N_JUDGING, seed + 1)
@@ -174,56 +170,6 @@ def _stronger(spec: ArmSpec) -> ArmSpec:
     more = MORE_PRESSURE * (high - low)
     chambers = {"pressure_min_kpa": max(low - more, -100.0), "pressure_max_kpa": high + more}
     return spec.replace(chambers=chambers)
-
-
-def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimator:
-    n_sections = spec.structure.n_sections
-    n_in, n_out = spec.n_springs + 3 * n_sections, N_CHANGES * n_sections
-    scale = np.full(N_CHANGES, CHANGE_SCALE)
-    scale[:3] *= spec.length_m / n_sections
-    params = ArmParams.from_spec(spec)
-    site_m = jnp.asarray(params.spring_site_m)
-    load_layers = initial_layers(jax.random.fold_in(key, 1), (n_in + 1, WIDTH, WIDTH, n_out))
-    *hidden, (weight, bias) = load_layers
-    return PoseEstimator(
-        layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
-        load_layers=(*hidden, (0.1 * weight, bias)),  # a load changes little at first
-        spring_site_m=site_m,
-        **_scaling("spring", "m", pool.spring_m),
-        load_centre_kg=jnp.asarray(spec.mass.payload_kg),
-        load_scale_kg=jnp.asarray(spec.mass.largest_payload_kg),
-        change_scale=jnp.asarray(scale),
-        base_position_m=jnp.asarray(params.mount.base_position_m),
-        base_rotation=jnp.asarray(params.mount.base_rotation),
-    )
-
-
-def _first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEstimator:
-    n_in = spec.n_springs + spec.n_chambers
-    return LoadEstimator(
-        layers=initial_layers(key, (n_in, WIDTH, WIDTH, 1)),
-        sd_layers=initial_layers(jax.random.fold_in(key, 1), (n_in, SD_WIDTH, SD_WIDTH, 1)),
-        **_scaling("spring", "m", pool.spring_m),
-        **_scaling("pressure", "kpa", pool.pressure_kpa),
-        load_scale_kg=jnp.asarray(spec.mass.payload_kg + spec.mass.largest_payload_kg),
-    )
-
-
-def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
-    n_chambers, n_springs = pool.pressure_kpa.shape[1], pool.spring_m.shape[1]
-    return SpringModel(
-        layers=initial_layers(key, (n_chambers, WIDTH, WIDTH, n_springs)),
-        **_scaling("pressure", "kpa", pool.pressure_kpa),
-        **_scaling("spring", "m", pool.spring_m),
-    )
-
-
-def _scaling(name: str, unit: str, values: Array) -> dict[str, Array]:
-    """Return the fields of a network that standardise a quantity (n, ...)."""
-    return {
-        f"{name}_centre_{unit}": jnp.mean(values, axis=0),
-        f"{name}_scale_{unit}": jnp.std(values, axis=0),
-    }
 
 
 def _pose_loss(estimator: PoseEstimator, pool: LoadedPool) -> Array:

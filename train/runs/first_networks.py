@@ -1,0 +1,72 @@
+"""Networks for the arm's computer before they learn: random weights, and scales by an arm's poses."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm._support.training import initial_layers
+from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.workspace import LoadedPool, Pool
+from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
+from mjx_softarm.sensing.load import LoadEstimator
+from mjx_softarm.spec import ArmSpec
+
+WIDTH = 128  # width of the hidden layers
+SD_WIDTH = 32  # width of those of the payload's error
+CHANGE_SCALE = 0.015  # scale of the pose network's outputs, in mean section lengths and half radians
+
+
+def first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimator:
+    """Return the pose network of an arm, scaled by poses of it; a load changes little at first."""
+    n_sections = spec.structure.n_sections
+    n_in, n_out = spec.n_springs + 3 * n_sections, N_CHANGES * n_sections
+    scale = np.full(N_CHANGES, CHANGE_SCALE)
+    scale[:3] *= spec.length_m / n_sections
+    params = ArmParams.from_spec(spec)
+    site_m = jnp.asarray(params.spring_site_m)
+    load_layers = initial_layers(jax.random.fold_in(key, 1), (n_in + 1, WIDTH, WIDTH, n_out))
+    *hidden, (weight, bias) = load_layers
+    return PoseEstimator(
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
+        load_layers=(*hidden, (0.1 * weight, bias)),
+        spring_site_m=site_m,
+        **_scaling("spring", "m", pool.spring_m),
+        load_centre_kg=jnp.asarray(spec.mass.payload_kg),
+        load_scale_kg=jnp.asarray(spec.mass.largest_payload_kg),
+        change_scale=jnp.asarray(scale),
+        base_position_m=jnp.asarray(params.mount.base_position_m),
+        base_rotation=jnp.asarray(params.mount.base_rotation),
+    )
+
+
+def first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEstimator:
+    """Return the payload network of an arm, scaled by poses of it."""
+    n_in = spec.n_springs + spec.n_chambers
+    return LoadEstimator(
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, 1)),
+        sd_layers=initial_layers(jax.random.fold_in(key, 1), (n_in, SD_WIDTH, SD_WIDTH, 1)),
+        **_scaling("spring", "m", pool.spring_m),
+        **_scaling("pressure", "kpa", pool.pressure_kpa),
+        load_scale_kg=jnp.asarray(spec.mass.payload_kg + spec.mass.largest_payload_kg),
+    )
+
+
+def first_spring_model(pool: Pool, key: Array) -> SpringModel:
+    """Return the network from pressures to springs, scaled by poses of an arm."""
+    n_chambers, n_springs = pool.pressure_kpa.shape[1], pool.spring_m.shape[1]
+    return SpringModel(
+        layers=initial_layers(key, (n_chambers, WIDTH, WIDTH, n_springs)),
+        **_scaling("pressure", "kpa", pool.pressure_kpa),
+        **_scaling("spring", "m", pool.spring_m),
+    )
+
+
+def _scaling(name: str, unit: str, values: Array) -> dict[str, Array]:
+    """Return the fields of a network that standardise a quantity (n, ...)."""
+    return {
+        f"{name}_centre_{unit}": jnp.mean(values, axis=0),
+        f"{name}_scale_{unit}": jnp.std(values, axis=0),
+    }
