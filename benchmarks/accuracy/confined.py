@@ -98,8 +98,10 @@ def measure(
 
 def stages(runs: Sequence[tuple[str, int, int]], env_steps: int) -> list[list[WorkStage]]:
     """Return the stages for runs (case, twin, seed), group by group."""
+    # Twins to calibrate, and tasks to demonstrate on them
     twins = sorted({twin for _, twin, _ in runs})
     tasks = dict.fromkeys((twin, CASES[case].task) for case, twin, _ in runs)
+    # Trainings, and trials of each policy
     trained = [
         WorkStage(
             f"train {run_name(*run)}", (f"{run_name(*run)}/{EVALUATION_FILE}",), train, (*run, env_steps)
@@ -112,6 +114,7 @@ def stages(runs: Sequence[tuple[str, int, int]], env_steps: int) -> list[list[Wo
         for run in runs
         for variant in VARIANTS
     ]
+    # Runs that take another run's reward are trained after it
     return [
         [WorkStage(f"twin {t}", (f"twin{t}/{CALIBRATION}",), jobs.calibrate_twin, (t,)) for t in twins],
         [

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy.arms import accuracy_of
-from benchmarks.harness.common import grouped, target
+from benchmarks.harness.common import arms_and_files, grouped, target
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.policy.file import load_policy
 
@@ -70,13 +70,8 @@ def _chosen(policies: Sequence[str]) -> list[dict[str, str]]:
     Raises:
         InputError: there are none, one is no ARM=FILE, or arms at rest and in motion differ.
     """
-    if not policies:
-        raise InputError("--policies: got none, expected ARM=FILE of each policy")
     chosen, arms = [], {"at rest": [], "in motion": []}
-    for text in policies:
-        arm, separator, file = text.partition("=")
-        if not separator:
-            raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
+    for arm, file in arms_and_files(policies):
         trained = "in motion" if load_policy(file).action_s else "at rest"
         chosen.append({"trained": trained, "arm": arm, "policy": file})
         arms[trained].append(arm)

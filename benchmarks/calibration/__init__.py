@@ -1,1 +1,1 @@
-"""What a calibration finds of an arm, and how well payloads are told with it."""
+"""Accuracy of calibrations, and of payloads that are told with them."""

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.common import target
-from mjx_softarm._support.errors import InputError
+from benchmarks.harness.common import arms_and_files, target
 from mjx_softarm.deploy.accuracy.measure import read_goals
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import open_arm
@@ -27,13 +26,9 @@ def measure(policies: tuple[str, ...], runs: int = 6, points: int = 6) -> dict[s
     Raises:
         InputError: there are no policies, or one has another form.
     """
-    if not policies:
-        raise InputError("--policies: got none, expected ARM=FILE of each")
     rows = []
-    for text in policies:
-        arm, equals, file = text.partition("=")
-        if not equals:
-            raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
+    for arm, file in arms_and_files(policies):
+        # The arm carries its largest payload; its runs share the goals of one circle.
         controller = Controller.of(load_policy(file))
         largest_g = round(1e3 * controller.policy.spec.mass.largest_payload_kg)
         goals = read_goals("circle", controller.policy, runs * points)
@@ -52,6 +47,7 @@ def measure(policies: tuple[str, ...], runs: int = 6, points: int = 6) -> dict[s
                 }
             )
             print(rows[-1], flush=True)
+    # Count the runs with a false overload.
     false, n = sum(row["overloaded"] > 0 for row in rows), len(rows)
     return {
         "targets": [target("no false overload", f"{false} of {n} runs", not false)],

@@ -60,6 +60,23 @@ def three_of(text: str, option: str, form: str) -> tuple[str, str, str]:
     return parts[0], parts[1], parts[2]
 
 
+def arms_and_files(policies: Sequence[str]) -> list[tuple[str, str]]:
+    """Return arm and file of each text ARM=FILE of the option `--policies`.
+
+    Raises:
+        InputError: there are none, or one has another form.
+    """
+    if not policies:
+        raise InputError("--policies: got none, expected ARM=FILE of each policy")
+    found = []
+    for text in policies:
+        arm, separator, file = text.partition("=")
+        if not separator:
+            raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
+        found.append((arm, file))
+    return found
+
+
 def mesh_of_cores(n_arms: int) -> Mesh | None:
     """Make devices of this process's cores, as many as n arms spread over evenly; call it before JAX is used.
 

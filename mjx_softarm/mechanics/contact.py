@@ -79,10 +79,8 @@ def wall_terms(contact: Contact, frames: Frames) -> tuple[Array, Array, Array]:
     below = once(jnp.stack(sums[::-1], axis=2))  # (7, 6, L, *arms)
 
     # Twists of the joints: a slide along its axis, a hinge about a line through its anchor
-    axis, anchor = (
-        jnp.moveaxis(frames.axis, 2, 0),
-        jnp.moveaxis(frames.anchor, 1, 0),
-    )  # (3, L, 3 dofs), (3, L)
+    axis = jnp.moveaxis(frames.axis, 2, 0)  # (3, L, 3 dofs)
+    anchor = jnp.moveaxis(frames.anchor, 1, 0)  # (3, L)
     slide, hinges = axis[:, :, :1], axis[:, :, 1:]
     arm = jnp.broadcast_to(anchor[:, :, None], hinges.shape)
     along = jnp.concatenate([slide, _cross(arm, hinges)], axis=2)

@@ -148,6 +148,7 @@ def checked(policy: Policy) -> Policy:
 
 def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     """Return the entries of a policy's file by name."""
+    # Texts and numbers of the policy itself
     entries: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "spec_json": json.dumps(policy.spec.to_dict()),
@@ -163,12 +164,14 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
         "workspace": policy.workspace,
         "provenance_json": json.dumps(policy.provenance),
     }
+    # The actor, and the numbers that it was trained with
     entries |= archive.layer_entries("actor", policy.layers)
     entries |= {f"action.{name}": getattr(policy.actions, name) for name in ("low", "high")}
     entries |= {f"gains.{name}": np.asarray(getattr(policy.gains, name), np.float64) for name in LAW}
     for name in ("obs_scale", "reward", "sensor"):
         numbers = entries_of(name, getattr(policy, name))
         entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
+    # Networks of the arm
     for name in ("estimator", "load_estimator", "spring_model", "s2r"):
         if getattr(policy, name) is not None:
             entries |= entries_of(name, getattr(policy, name))

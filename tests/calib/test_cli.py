@@ -117,7 +117,7 @@ def test_a_later_log_that_shows_no_change_names_no_export(demo, calibrated, tmp_
 
 
 def test_a_plan_tells_what_the_calibration_told(calibrated, tmp_path, capsys):
-    """The same count of unknown directions, and the same payloads."""
+    """Unknown directions and payloads are those that the calibration told."""
     parts = json.loads((calibrated[1] / "report.json").read_text())["parts"]
     n_weak = len(parts["Chambers"]["figures"]["weak"])
     widths_g = parts["Sim-to-real network"]["figures"]["payload_half_width_g"]

@@ -55,7 +55,7 @@ def test_a_run_from_demonstrations_goes_on_with_them(run_of, monkeypatch, capsys
 
 
 def told(then, figures, monkeypatch, capsys):
-    """What is said where the later arm has these figures; the run's own are not found anew."""
+    """Advice by the later arm's figures; those of the run itself are not found anew."""
     now = renewed(then, then.arm)
 
     def task_of(run):
