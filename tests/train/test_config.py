@@ -74,6 +74,13 @@ def test_json_with_a_setting_too_many_is_refused_and_a_missing_one_has_its_defau
     assert from_dict({"learner": {"name": "tqc"}}) == TrainConfig()
 
 
+def test_runs_that_do_not_tell_their_activation_have_relu_networks():
+    data = to_dict(TrainConfig(learner=AnalyticConfig()))
+    assert from_dict(data).learner.activation == "swish"
+    del data["learner"]["activation"]
+    assert from_dict(data).learner.activation == "relu"
+
+
 def test_an_epoch_count_covers_the_steps_asked_for():
     config = TQCConfig(
         total_env_steps=10_001, n_arms=100, vector_steps_per_epoch=10, updates_per_env_step=0.5
