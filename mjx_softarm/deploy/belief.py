@@ -62,7 +62,8 @@ class Belief:
         window = Window(*(np.empty((0, n)) for n in (n_springs, n_chambers, n_chambers)))
         springs, chambers = np.zeros(n_springs, bool), np.zeros(n_chambers, bool)
         masks = springs, springs, chambers, chambers
-        unknown_m, load = np.full(n_springs, np.nan), Load(spec.mass.payload_kg)
+        own_kg, unknown_m = spec.mass.payload_kg, np.full(n_springs, np.nan)
+        load = Load(own_kg, assumed_kg=own_kg)
         return cls(controller, Command.none(spec), window, unknown_m, *masks, load)
 
     @property
@@ -147,12 +148,12 @@ def _weighed(
     The estimate takes mean springs and pressures at rest. An estimate that is no payload leaves the specified
     payload, and so does a first one that is not known well.
     """
-    policy, model = controller.policy, controller.policy.load_estimator
+    model = controller.policy.load_estimator
     most_kg = float(model.load_scale_kg)
     estimate_kg = float(estimate_load(model, mean_m, mean_kpa))
     width_kg = float(load_half_width(model, mean_m, mean_kpa))
     if not LOWEST * most_kg <= estimate_kg <= HIGHEST * most_kg:
-        return Load(policy.spec.mass.payload_kg), estimate_kg, width_kg
+        return Load(load.assumed_kg, assumed_kg=load.assumed_kg), estimate_kg, width_kg
     if width_kg > controller.config.load_known * most_kg:
         return load, estimate_kg, width_kg
     return averaged(load, estimate_kg, width_kg, most_kg), estimate_kg, width_kg

@@ -12,7 +12,7 @@ from mjx_softarm.export.golden import FLAGS, PROGRAM_VERSION
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import file_entries
 from mjx_softarm.policy.reach import N_STEPS, begin
-from mjx_softarm.sensing.load import HIGHEST, JUMP, LOWEST, N_AVERAGED, N_JUMPS
+from mjx_softarm.sensing.load import HIGHEST, JUMP, LOWEST, N_AVERAGED, N_JUMPS, QUANTILE
 
 _TEMPLATES = ("softarm.hpp.in", "rows.cpp", "example.cpp", "CMakeLists.txt")
 
@@ -55,6 +55,7 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "THRESHOLD": repr(policy.reward.threshold),
         "OBSERVES_LOAD": str(controller.observes_payload).lower(),
         "OWN_LOAD": repr(policy.spec.mass.payload_kg),
+        "QUANTILE": repr(QUANTILE),
         "LEAST_LOAD": repr(LOWEST * most_kg),
         "GREATEST_LOAD": repr(HIGHEST * most_kg),
         "LOAD_KNOWN": repr(config.load_known * most_kg),

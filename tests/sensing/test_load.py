@@ -91,5 +91,10 @@ def test_one_odd_rest_is_forgotten():
     assert load.kg == pytest.approx(0.6) and not load.began
 
 
-def test_less_than_nothing_is_reckoned_as_nothing():
-    assert after(-0.1).believed_kg == 0.0 and after(-0.1, 0.1, 0.15).believed_kg == pytest.approx(0.05)
+@pytest.mark.parametrize(
+    ("kg", "assumed_kg", "believed_kg"),
+    [(0.1, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.2, 0.0, 0.15), (0.3, 0.2, 0.2), (0.4, 0.2, 0.35)],
+)
+def test_a_difference_from_the_assumed_payload_is_believed_as_far_as_known(kg, assumed_kg, believed_kg):
+    load = Load(kg, 3, half_width_kg=1.96 * 0.1, assumed_kg=assumed_kg)
+    assert load.believed_kg == pytest.approx(believed_kg)
