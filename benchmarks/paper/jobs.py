@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import os
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from benchmarks.paper.scene import CALIBRATION, demonstrations_path, scene_of, s
 from mjx_softarm.mechanics.pipe import PIPES
 from mjx_softarm.spec import ARM_FILE
 
+# Without S2R a pose is off by several millimetres: a sixth of the steps teaches it.
+WITHOUT_S2R = ("learner.total_env_steps=524288",)
 # Presets that differ in the payload alone: a run beside the experiment's own gets the same further settings.
 ALIKE = {"analytic", "payload"}
 MOVING, N_MOVING = "moving.npz", 8  # log of a rod in motion, and its number of poses
@@ -65,7 +68,9 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
 def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
     """Train a policy of the nominal arm or of a twin's calibration."""
     arm = [] if twin is None else ["--calibration", folder / f"twin{twin}" / CALIBRATION]
-    _reach(folder / reach_run(twin, seed), seed, "--preset", settings.preset, *_further(settings), *arm)
+    _reach(
+        folder / reach_run(twin, seed), seed, "--preset", settings.preset, *_options(settings.training), *arm
+    )
 
 
 def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> None:
@@ -74,15 +79,16 @@ def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: in
     if preset:
         options = ["--preset", preset, "--calibration", calibration]
         if {preset, settings.preset} == ALIKE or preset == settings.preset:
-            options += _further(settings)
+            options += _options(settings.training)
     else:
-        options = ["--preset", settings.preset, *_further(settings), "--spec", calibration / ARM_FILE]
+        training = settings.training or WITHOUT_S2R
+        options = ["--preset", settings.preset, *_options(training), "--spec", calibration / ARM_FILE]
     _reach(folder / learned_run(name, twin, seed), seed, *options)
 
 
-def _further(settings: Settings) -> list[str]:
-    """Return the options of the experiment's further settings."""
-    return [f"--{text}" for text in settings.training]
+def _options(settings: Iterable[str]) -> list[str]:
+    """Return the options of further settings of a training, NAME=VALUE."""
+    return [f"--{text}" for text in settings]
 
 
 def _reach(run: Path, seed: int, *options: Any) -> None:

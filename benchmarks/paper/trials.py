@@ -53,10 +53,11 @@ def _open_trials(settings: Settings) -> list[Trial]:
     loads_g, found = (0, *settings.loads_g), []
     for twin in settings.twins:
         for seed in settings.seeds:
-            found += [Trial(kind, twin, seed) for kind in ("specified", "without", "chambers")]
+            found += [Trial(kind, twin, seed) for kind in ("specified", "without")]
             told = ("with", *settings.beside)
             found += [Trial(kind, twin, seed, load_g=load_g) for kind in told for load_g in loads_g]
-        # Gradient descent is not trained, so it runs once for each twin and load.
+        # Without S2R one seed is enough. Gradient descent is not trained, so it runs once for each load.
+        found.append(Trial("chambers", twin, settings.seeds[0]))
         found += [Trial("gradient", twin, settings.seeds[0], load_g=load_g) for load_g in loads_g]
     return found
 
@@ -91,7 +92,8 @@ def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
 
 def _open_learning(settings: Settings) -> list[list[WorkStage]]:
     """Return the stages that train and export the policies of open space."""
-    others = [(kind, *run) for kind in ("chambers", *settings.beside) for run in _runs(settings)]
+    others = [("chambers", twin, settings.seeds[0]) for twin in settings.twins]
+    others += [(kind, *run) for kind in settings.beside for run in _runs(settings)]
     nominal = [_reach(None, seed) for seed in settings.seeds]
     on_twins = [_reach(*run) for run in _runs(settings)]
     return [

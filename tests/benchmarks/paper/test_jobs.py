@@ -78,6 +78,13 @@ def test_further_policies_have_a_preset_of_their_own_or_no_network(tmp_path, com
     assert parsed(resume).resume == options.out
 
 
+def test_arms_without_a_network_learn_for_less_long_but_for_steps_of_the_experiment_s_own(tmp_path, commands):
+    for training, n in (((), 524_288), (("learner.total_env_steps=512",), 512)):
+        settings = dataclasses.replace(TINY, preset="analytic", training=training)
+        (start,) = commands(jobs.train_other, tmp_path, settings, "chambers", 1, 2)
+        assert parsed(start).config.learner.total_env_steps == n
+
+
 def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path, commands):
     run, work = tmp_path / learned_run("narrow", 1, 2), (jobs.learn, tmp_path, TINY, "narrow", 1, 2)
     (start,) = commands(*work)

@@ -9,7 +9,7 @@ from tests.benchmarks.paper.made_up import TINY
 
 def test_three_twins_and_three_seeds():
     found = trials("open", Settings())
-    assert len(found) == len(set(found)) == 3 * 3 * (4 + 6) + 3 * 7
+    assert len(found) == len(set(found)) == 3 * 3 * (3 + 6) + 3 * (7 + 1)
     assert sum(trial.kind == "gradient" for trial in found) == 3 * 7
     beside = trials("open", dataclasses.replace(Settings(), beside=("quick", "payload")))
     assert len(beside) == len(set(beside)) == len(found) + 2 * 9 * 7
