@@ -12,6 +12,8 @@ import importlib
 import importlib.util
 import inspect
 import itertools
+import os
+import select
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +24,8 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support.errors import InputError, missing
 
-ERROR, INTERRUPTED = 2, 130  # exit statuses
+ERROR, INTERRUPTED, UNREAD = 2, 130, 141  # exit statuses; the last is a shell's for SIGPIPE
+STDOUT = 1  # file descriptor
 # Packages of the extra `train` that modules import as they are loaded.
 TRAIN = {"flax", "jax", "jinja2", "matplotlib", "mujoco", "optax", "orbax", "rich", "scipy"}
 
@@ -47,20 +50,22 @@ def main(
         finish: turns a command's name and its result into an exit status.
 
     Returns:
-        The command's exit status; 2 after an error that its user can put right, 130 after Ctrl-C.
+        The command's exit status, or one of `guarded`.
     """
-    # List the commands where the words name none, or a group such as `demos`.
     words = sys.argv[1:] if arguments is None else list(arguments)
-    group = list(itertools.takewhile(lambda word: word not in ("-h", "--help"), words))
-    shown = [name for name in commands if (parts := name.split()) != group and parts[: len(group)] == group]
-    if shown:
-        width = max(map(len, shown))
-        lines = [f"  {name:{width}}  {_line(commands[name])}" for name in shown]
-        print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
-        return 0
 
-    # Run the command.
     def run() -> int:
+        # List the commands where the words name none, or a group such as `demos`.
+        group = list(itertools.takewhile(lambda word: word not in ("-h", "--help"), words))
+        shown = [
+            name for name in commands if (parts := name.split()) != group and parts[: len(group)] == group
+        ]
+        if shown:
+            width = max(map(len, shown))
+            lines = [f"  {name:{width}}  {_line(commands[name])}" for name in shown]
+            print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
+            return 0
+        # Run the command.
         name, command = read(prog, commands, words)
         return finish(name, command())
 
@@ -68,7 +73,28 @@ def main(
 
 
 def guarded(run: Callable[[], int]) -> int:
-    """Run a command; return its exit status, 2 after an error that its user can put right, 130 on Ctrl-C."""
+    """Run a command.
+
+    Args:
+        run: the command; returns its exit status.
+
+    Returns:
+        Its exit status; 2 after an error that its user can put right, 130 after Ctrl-C, and 141 where the
+        reader of its output has ended, as `head` does. Such a command ends quietly.
+    """
+    try:
+        status = _status(run)
+        print(end="", flush=True)  # a closed pipe is met here, not as Python ends
+    except BrokenPipeError:
+        # The rest of the output goes nowhere, as https://docs.python.org/3/library/signal.html#note-on-sigpipe
+        # advises. SIGPIPE stays ignored, since it would end a command whose arm is under pressure.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), STDOUT)
+        return UNREAD
+    return status
+
+
+def _status(run: Callable[[], int]) -> int:
+    """Return a command's exit status; errors that its user can put right are told on stderr."""
     try:
         return run()
     except SystemExit as stop:
@@ -78,6 +104,8 @@ def guarded(run: Callable[[], int]) -> int:
     except InputError as error:
         text = str(error)
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _is_unread():
+            raise
         why = f"{error.filename}: got {error.strerror!r}, expected a file or folder that can be used"
         text = why if error.filename else str(error)
     except ModuleNotFoundError as error:
@@ -88,6 +116,13 @@ def guarded(run: Callable[[], int]) -> int:
         return INTERRUPTED
     print(f"error: {text}", file=sys.stderr)
     return ERROR
+
+
+def _is_unread() -> bool:
+    """Return whether the output is a pipe whose reader has ended."""
+    poll = select.poll()
+    poll.register(STDOUT, 0)  # asks for errors alone
+    return bool(poll.poll(0))
 
 
 def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tuple[str, Callable[[], Any]]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -72,13 +75,16 @@ def show(
     return 3
 
 
-def fail(how: Literal["bug", "input", "file", "interrupt"]) -> int:
+def fail(how: Literal["bug", "input", "file", "gone", "interrupt"]) -> int:
     """Fail."""
     if how == "file":
         Path("absent/file").read_text()
-    raise {"bug": ValueError("a bug"), "input": InputError("x: got 1, expected 2")}.get(
-        how, KeyboardInterrupt()
-    )
+    errors = {
+        "bug": ValueError("a bug"),
+        "input": InputError("x: got 1, expected 2"),
+        "gone": BrokenPipeError(32, "gone"),
+    }
+    raise errors.get(how, KeyboardInterrupt())
 
 
 RESULTS = []
@@ -114,7 +120,7 @@ def test_functions_of_two_words_get_lists_and_flags():
         ("make --inner.gamma 2", "Inner.gamma: got 2.0, expected at most 1"),
         ("make more", "Unrecognized options: more"),
         ("show files --seeds 0,a", "--seeds: got '0,a', expected whole numbers|N,N,..."),
-        ("fail", "Missing from program fail:|--how {bug,input,file,interrupt}"),
+        ("fail", "Missing from program fail:|--how {bug,input,file,gone,interrupt}"),
     ],
 )
 def test_a_bad_option_is_told_with_what_it_may_be(words, told, capsys, monkeypatch):
@@ -132,6 +138,7 @@ def test_a_bad_option_is_told_with_what_it_may_be(words, told, capsys, monkeypat
         ("make --n 0", "n: got 0, expected at least 1"),
         ("fail --how input", "x: got 1, expected 2"),
         ("fail --how file", "absent/file: got 'No such file or directory', expected a file"),
+        ("fail --how gone", "[Errno 32] gone"),  # of an arm's connection, not of the output
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(words, message, capsys):
@@ -149,6 +156,42 @@ def test_a_program_that_ends_itself_keeps_its_status_or_its_message(code, status
 
     assert cli.guarded(ends) == status
     assert capsys.readouterr().err == told
+
+
+PRINTS = """
+import sys
+from mjx_softarm._support import cli
+
+def many(n: int) -> int:
+    \"""Print lines.\"""
+    print("line\\n" * n, end="")
+    return 0
+
+def at_once(n: int) -> int:
+    \"""Print lines, each at once.\"""
+    for _ in range(n):
+        print("line", flush=True)
+    return 0
+
+sys.exit(cli.main("program", "About it.", {"many": many, "at once": at_once}))
+"""
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize(
+    "words", ["", "many --help", "many --n 10", "many --n 90000", "at once --n 2", "many --n one"]
+)
+def test_a_command_whose_output_is_not_read_ends_quietly(words, together):
+    """The reader has ended before the first line, on both streams where they go one way."""
+    unread, output = os.pipe()
+    os.close(unread)
+    errors = output if together else subprocess.PIPE
+    ended = subprocess.run([sys.executable, "-c", PRINTS, *words.split()], stdout=output, stderr=errors)
+    os.close(output)
+    if words.endswith("one") and not together:
+        assert ended.returncode == 2 and b"INT" in ended.stderr
+    else:
+        assert ended.returncode == 141 and not ended.stderr
 
 
 def test_a_bug_is_not_taken_for_a_mistake_of_the_user():
