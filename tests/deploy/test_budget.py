@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from calib.changes import MIN_POSES
 from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.accuracy.budget import Budget, budget
 from mjx_softarm.deploy.accuracy.measure import figures, measure, write_accuracy
@@ -65,7 +66,7 @@ def split(arm, plan=nearest_springs, payload_kg=0.0, policy=KNOWN):
     run = go(arm, goals=GOALS_OF_CIRCLE, controller=controller)
     found = budget(run, controller, payload_kg)
     error_mm = figures(measure(run, controller, GOALS_OF_CIRCLE), run.counts())["translation_mm"]
-    assert found.total_mm == pytest.approx(error_mm, rel=1e-6)
+    assert found.total_mm == pytest.approx(error_mm, rel=1e-6) and found.n_goals == len(run.arrivals)
     return found
 
 
@@ -111,9 +112,22 @@ def test_shifts_of_the_springs_zeros_are_found_as_far_as_eight_goals_tell():
 )
 def test_an_arm_that_is_hardly_that_of_the_calibration(parts_mm, shift_mm, strange):
     """Parts that cancel, or zeros that no sensor loses, are of another arm; an aged one is not."""
-    found = Budget(parts_mm, np.full(N, shift_mm), 0.0, 0.0, 0.2, 3, calibrated=True)
+    found = Budget(parts_mm, np.full(N, shift_mm), 0.0, 0.0, 0.2, 8, 3, calibrated=True)
     assert found.strange == strange == ("likely another arm" in found.lines()[1])
     assert not found._replace(calibrated=False).strange
+
+
+@pytest.mark.parametrize("largest", ["springs", "rest"])
+@pytest.mark.parametrize("n", [3, MIN_POSES - 1, MIN_POSES])
+def test_few_goals_lead_to_more_goals(largest, n):
+    """Under eight, `calib run --since` refuses the log; it fits zeros, so it never helps with the rest."""
+    found = Budget({"law": 0.1, largest: 2.0}, np.zeros(N), 0.0, 0.0, 0.2, n, 0, calibrated=True)
+    sentence = found.lines()[1]
+    few = n < MIN_POSES
+    assert (f"{n} goals do not tell a change from chance: measure {MIN_POSES} or more" in sentence) == few
+    assert ("--since" in sentence) == (not few and largest == "springs")
+    assert ("record poses anew" in sentence) == (not few and largest == "rest")
+    assert "calibrate it and train" in found._replace(calibrated=False).lines()[1] or largest == "springs"
 
 
 def test_errors_as_at_the_calibration_are_the_models():

@@ -33,6 +33,7 @@ ZERO_M = 1e-3  # prior of the shift of a spring's zero; by hand
 STEP_M = 2e-4  # of the finite differences
 MM_PER_DEG = 0.9  # weight of a turn beside a distance, as for the networks of the pose
 TOLD_MM = 0.4  # shift of a spring's zero that the sentence names
+MIN_GOALS = 8  # goals that show a change of the arm; `calib run --since` refuses fewer
 # Shift of a zero, and largest part over the error, from which the arm is hardly that of the calibration; by
 # hand. Aged twins have 1.5 mm and 1.0, policies on other twins of the same arm 14 mm.
 STRANGE_MM, STRANGE_RATIO = 5.0, 1.5
@@ -46,6 +47,7 @@ class Budget(NamedTuple):
     believed_g: float  # mean payload that the loop believed
     payload_g: float  # payload that hung at the gripper
     off_mm: float  # mean over goals of the largest distance of a spring from its reference
+    n_goals: int  # goals that were measured
     n_saturated: int  # goals with a saturated chamber
     calibrated: bool  # whether the policy has the calibration of an arm
 
@@ -87,7 +89,11 @@ def _remedies(found: Budget) -> dict[str, str]:
     """Return cause and remedy of each part, in words."""
     shifted = np.flatnonzero(np.abs(found.shift_mm) > TOLD_MM)
     zeros = ", ".join(f"spring{k} {found.shift_mm[k]:+.1f}" for k in shifted) or "all by little"
+    # Remedies of a change; few goals do not show one.
     again = "`python -m calib run LOG --since CALIBRATION` with this log, then `train export --calibration`"
+    anew = "record poses anew, and calibrate with them"
+    if found.n_goals < MIN_GOALS:
+        again = anew = f"{found.n_goals} goals do not tell a change from chance: measure {MIN_GOALS} or more"
     off = f"springs end {found.off_mm:.1f} mm off their references"
     return {
         "policy": "its references miss the goals by its own models: train longer, or by the preset analytic",
@@ -99,7 +105,8 @@ def _remedies(found: Budget) -> dict[str, str]:
         "springs": f"zeros have shifted since the calibration, about [mm]: {zeros}: {again}",
         "estimator": "the distilled pose is off its simulation: only a finer network would help",
         "S2R": "as large as at the calibration's held-out poses: record the poses of `calib plan`",
-        "rest": "the pose changes as no spring shows, as by hysteresis, or the arm has changed: " + again
+        # `--since` fits the springs' zeros, which explain the part `springs` alone.
+        "rest": "the pose changes as no spring shows, as by hysteresis, or the arm has changed: " + anew
         if found.calibrated
         else "the policy does not know this arm: calibrate it and train (docs/your-arm.md)",
     }
@@ -150,6 +157,7 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float) -> Budget | 
         believed_g=1e3 * float(load_kg.mean()),
         payload_g=1e3 * payload_kg,
         off_mm=1e3 * float(np.abs(spring_m - reference_m).max(axis=1).mean()),
+        n_goals=len(both),
         n_saturated=sum(bool(rest.saturated.any()) for _, rest in both),
         calibrated=policy.calibrated,
     )
