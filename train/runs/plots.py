@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter, LogLocator, NullFormatter
 
 from train.runs.evaluate import Reached
 from train.runs.positions import AtPositions
@@ -142,14 +142,20 @@ def workspace_figure(workspace: Reached) -> Figure:
         points = panel.scatter(goal[order, x], goal[order, y], **colours)
         panel.set_aspect("equal")
     figure.colorbar(points, ax=above, label="mm", extend="max")
-    # Distribution, with its median and 95 %.
-    axes.plot(np.sort(error), 100 * np.arange(1, len(error) + 1) / len(error), color=BLUE)
-    for share, colour in ((50, GREY), (95, ORANGE)):
-        at = float(np.quantile(error, share / 100))
-        axes.plot([at, at], [0, share], color=colour, linewidth=1, label=f"{share} %: {at:.1f} mm")
-    axes.set_xlim(0, 3 * top)
-    axes.set_xscale("symlog", linthresh=1.0)
+    # Distribution, with its median and 95 %, over a decade at least; the smallest 2 % are drawn at its rim.
+    high = max(1.2 * float(error.max()), 0.1)
+    low = float(np.clip(np.quantile(error, 0.02), max(high / 1e3, 0.01), high / 10))
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    share = 100 * np.arange(1, len(error) + 1) / len(error)
+    axes.plot(np.maximum(np.sort(error), low), share, color=BLUE)
+    for percent, colour in ((50, GREY), (95, ORANGE)):
+        at = float(np.quantile(error, percent / 100))
+        label = f"{percent} %: {at:.2f} mm"
+        axes.plot(np.maximum([at, at], low), [0, percent], color=colour, linewidth=1, label=label)
     axes.set_ylim(0, 100)
     axes.legend(frameon=False, loc="upper left")
     return figure
