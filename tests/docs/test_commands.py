@@ -132,7 +132,7 @@ JOURNEY = ("README.md", *(f"docs/{name}.md" for name in NAMES))
 FEWER = (
     (r"--poses \d+", "--poses 24"),
     (r"--points \d+", "--points 2"),
-    (r"(record --arm twin:7) ", r"\1 --poses 24 "),
+    (r"(record --arm twin:0) ", r"\1 --poses 24 "),
     (
         r"(train (reach|imitate|sweep) .*--(preset|calibration).*)",
         r"\1 --learner.total-env-steps 2048 --env.n-poses 256",
