@@ -127,8 +127,10 @@ def make_arm_model():
         networks = layers(n_in, 4, n_changes), layers(n_in + 1, 4, n_changes)
         estimator = PoseEstimator(*networks, site_m, row(0.18), row(0.05), *kg, row(1e-3, 6))
         scaling, kpa = (row(0.18), row(0.05)), (row(-10.0, spec.n_chambers), row(30.0, spec.n_chambers))
-        error = ((np.zeros((n + spec.n_chambers, 1), np.float32), np.full(1, -2.3, np.float32)),)
-        load = LoadEstimator(layers(n + spec.n_chambers, 4, 1), error, *scaling, *kpa, np.float32(1.0))
+        n_out, blocks = 2 * spec.n_chambers + n_sections, (n_sections, spec.n_chambers // n_sections)
+        plane = np.float32(0.1 * rng.normal(size=(n, n_out))), *scaling, row(-4.0, n_out), row(1.0, n_out)
+        known = np.float32(np.tile(np.eye(blocks[1]), (n_sections, 1, 1)))
+        load = LoadEstimator(layers(n, 4, n_out), *plane, known, 0.1 * known, *kg)
         springs = SpringModel(layers(spec.n_chambers, 5, n), *kpa, *scaling)
         poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
         n_in = N_POSE_INPUTS + n

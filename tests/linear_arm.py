@@ -97,6 +97,27 @@ def nan(readings):
     return np.where(np.arange(N) == 4, np.nan, readings)
 
 
+def load_estimator_of(spec, effect_kpa_per_kg, sd_kg=0.05):
+    """An estimator that is exact for the linear arm, where a payload has this effect on the chambers."""
+    n, n_sections, c = spec.n_springs, spec.structure.n_sections, spec.structure.chambers_per_section
+    effect, slope = np.asarray(effect_kpa_per_kg, float), np.linalg.pinv(gain_of(spec)).T
+    n_out, shares = 2 * spec.n_chambers + n_sections, np.zeros(n_sections)
+    covariance = np.tile(sd_kg**2 * (effect**2).sum() * np.eye(c), (n_sections, 1, 1))
+    fields = {
+        "slope": np.concatenate([slope, np.zeros((n, n_out - spec.n_chambers))], axis=1),
+        "spring_centre_m": spec.at_springs(spec.geometry.section_length_m),
+        "spring_scale_m": np.ones(n),
+        "out_centre": np.concatenate([np.zeros(spec.n_chambers), effect, shares]),
+        "out_scale": np.ones(n_out),
+        "covariance_kpa2": covariance,
+        "error_kpa2": 0.0 * covariance,
+        "own_load_kg": 0.0,
+        "load_scale_kg": 1.0,
+    }
+    layers = ((np.zeros((n, n_out), np.float32), np.zeros(n_out, np.float32)),)
+    return LoadEstimator(layers, **{name: np.float32(value) for name, value in fields.items()})
+
+
 def make_policy(spec=SPEC):
     """A policy whose estimator and spring model are exact for the linear arm; its actor is not looked at."""
     n, n_sections = spec.n_springs, spec.structure.n_sections
@@ -117,15 +138,7 @@ def make_policy(spec=SPEC):
         load_scale_kg=np.float32(1.0),
         change_scale=np.ones(6, np.float32),
     )
-    load = LoadEstimator(
-        layers=((np.zeros((n + spec.n_chambers, 1), np.float32), np.zeros(1, np.float32)),),
-        sd_layers=((np.zeros((n + spec.n_chambers, 1), np.float32), np.full(1, np.log(0.05), np.float32)),),
-        spring_centre_m=springs,
-        spring_scale_m=springs + 1,
-        pressure_centre_kpa=chambers,
-        pressure_scale_kpa=chambers + 1,
-        load_scale_kg=np.float32(1.0),
-    )
+    load = load_estimator_of(spec, np.full(spec.n_chambers, 1e5))  # no pressure counts as a payload
     model = SpringModel(
         layers=((gain.T.astype(np.float32), springs),),
         pressure_centre_kpa=chambers,

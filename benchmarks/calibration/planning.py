@@ -33,7 +33,7 @@ from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.policy.file import load_policy
-from mjx_softarm.sensing.load import estimate_load, load_half_width
+from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import S2R_SESSION
 from mjx_softarm.twin.rod_twin import RodTwin
@@ -161,11 +161,11 @@ def of_run(run: LoopRun, controller: Controller, goals: np.ndarray, payload_g: f
     assert run.log.pressure_kpa is not None  # as the loop logs it
 
     # Payloads of each arrival alone, by the network; the loop averages them
-    networks, each_g = (estimate_load, load_half_width), []
+    each_g = []
     for arrival in run.arrivals:
         rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
         means = at_rest(run, controller, arrival).spring_m, run.log.pressure_kpa[rows].mean(axis=0)
-        each_g.append([1e3 * float(network(policy.load_estimator, *means)) for network in networks])
+        each_g.append([1e3 * float(kg) for kg in estimate_load(policy.load_estimator, *means)])
     kg, half_width = np.array(each_g).T
     return {
         "measured": told["measured"],

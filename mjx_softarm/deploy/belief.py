@@ -20,7 +20,7 @@ from mjx_softarm.control import Allocation, Gains, allocated_error, at_chambers,
 from mjx_softarm.deploy.controller import LOOP, Command, Controller, LoopConfig
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
-from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load, load_half_width
+from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 
 _NO_EFFECT_M2 = 1e-18
@@ -150,8 +150,7 @@ def _weighed(
     """
     model = controller.policy.load_estimator
     most_kg = float(model.load_scale_kg)
-    estimate_kg = float(estimate_load(model, mean_m, mean_kpa))
-    width_kg = float(load_half_width(model, mean_m, mean_kpa))
+    estimate_kg, width_kg = map(float, estimate_load(model, mean_m, mean_kpa))
     if not LOWEST * most_kg <= estimate_kg <= HIGHEST * most_kg:
         return Load(load.assumed_kg, assumed_kg=load.assumed_kg), estimate_kg, width_kg
     if width_kg > controller.config.load_known * most_kg:

@@ -17,7 +17,7 @@ from mjx_softarm.policy import reach
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.reachable import distances
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
-from mjx_softarm.sensing.load import estimate_load, load_half_width
+from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.sensors import Reading, SensorFault
 from mjx_softarm.spec import ArmSpec
 
@@ -60,6 +60,7 @@ def answer(
     # References of the policy.
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
+    told_kg, half_width_kg = estimate_load(policy.load_estimator, reading.length_m, pressure_kpa)
     pose, away = tip_pose(policy, reading.length_m, load_kg)
     observed = sensed(policy, pose, reading.length_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
@@ -75,8 +76,8 @@ def answer(
         "pose": pose,
         "extrapolation": away,
         "goal_outside": ~inside,
-        "load_estimate_kg": estimate_load(policy.load_estimator, reading.length_m, pressure_kpa),
-        "load_half_width_kg": load_half_width(policy.load_estimator, reading.length_m, pressure_kpa),
+        "load_estimate_kg": told_kg,
+        "load_half_width_kg": half_width_kg,
     }
 
 
@@ -138,6 +139,7 @@ def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]
     reading = policy.sensor.lengths(at.readings, at.spring_m)
     tip, away = tip_pose(policy, at.spring_m, at.load_kg)
     means = xp.mean(at.springs_m, axis=0), xp.mean(at.pressures_kpa, axis=0)
+    told_kg, half_width_kg = estimate_load(policy.load_estimator, *means)
     # Policy.
     motion = _in_motion(policy.spec)
     observed = sensed(policy, at.pose, at.spring_m, motion, at.load_kg)
@@ -151,12 +153,7 @@ def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]
     return {
         "lengths": _of(at.readings, at.spring_m, length_m=reading.length_m, lost=_lost(reading)),
         "mean_length": _of(at.springs_m, mean_m=means[0]),
-        "estimated_load": _of(
-            at.springs_m,
-            at.pressures_kpa,
-            kg=estimate_load(policy.load_estimator, *means),
-            width_kg=load_half_width(policy.load_estimator, *means),
-        ),
+        "estimated_load": _of(at.springs_m, at.pressures_kpa, kg=told_kg, width_kg=half_width_kg),
         "tip": _of(at.spring_m, at.load_kg, tip=tip, away=constant(away)),
         "references": _of(*acting, asked_m=policy.actions.lengths(action)),
         "law": _of(at.reference_m, at.spring_m, *state, **law),

@@ -182,5 +182,5 @@ def _weight_kpa(policy: Policy, pressure_kpa: np.ndarray, share: float) -> float
     model, less_kpa = policy.load_estimator, np.linspace(-_WEIGHT_MAX_KPA, _WEIGHT_MAX_KPA, 201)
     shown_kpa = pressure_kpa - less_kpa[:, None]  # (201, n_chambers)
     spring_m = expected_springs(policy.spring_model, shown_kpa)
-    estimate_kg = estimate_load(model, spring_m, np.broadcast_to(pressure_kpa, shown_kpa.shape))
+    estimate_kg, _ = estimate_load(model, spring_m, np.broadcast_to(pressure_kpa, shown_kpa.shape))
     return float(less_kpa[np.argmin(np.abs(estimate_kg - share * model.load_scale_kg))])

@@ -23,7 +23,7 @@ float64, networks and the workspace float32.
     tolerance_m          ()           greatest error of a spring that counts as on its reference
     workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
     estimator.<field>                 `PoseEstimator`: spring lengths and payload to the simulated pose
-    load_estimator.<field>            `LoadEstimator`: spring lengths and pressures to payload and error
+    load_estimator.<field>            `LoadEstimator`: spring lengths to the pressures that hold them
     spring_model.<field>              `SpringModel`: pressures to spring lengths, to find chambers that fail
     s2r_kind             ()           "mlp", or "none": the policy was trained on simulated poses
     s2r.<field>                       `S2R`, if there is one: simulated pose to the real one
@@ -60,7 +60,7 @@ from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 from mjx_softarm.spec_tables import Mounting
 
-SCHEMA_VERSION = 12
+SCHEMA_VERSION = 13
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it

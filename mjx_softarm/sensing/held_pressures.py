@@ -12,7 +12,7 @@ corrects them. Its variance tells how well a payload is known: it is large far f
 
 A payload changes a chamber's pressure by the simulated change times a factor. The log of an unloaded arm does
 not show this factor: with all stiffnesses, areas and masses greater by the same share, the log is the same.
-So the factors are normally distributed about 1, with the deviations below.
+So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`.
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
@@ -26,10 +26,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
+from mjx_softarm.sensing.load import COMMON_FACTOR, OWN_FACTOR
 
-# Standard deviations of the factors; by hand, from rods: of all chambers together, by masses and areas that
-# are off by some per cent; of each chamber at each pose.
-COMMON_FACTOR, OWN_FACTOR = 0.05, 0.14
 KIND = "pressures"
 PRESSURES_FILE = "pressures.npz"  # in the folder of a calibration, and of a run that was trained with it
 

@@ -11,7 +11,18 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.sensing.estimator import estimate
-from tests.linear_arm import GAIN_M_PER_KPA, POLICY, REST_M, SPEC, LinearArm, N, asking, go, read_m
+from tests.linear_arm import (
+    GAIN_M_PER_KPA,
+    POLICY,
+    REST_M,
+    SPEC,
+    LinearArm,
+    N,
+    asking,
+    go,
+    load_estimator_of,
+    read_m,
+)
 
 STRETCH_M_PER_KG = 0.004  # of each spring, at held pressures
 SINK_M_PER_KG = 0.005  # of each section's end, at held springs
@@ -20,14 +31,12 @@ GOAL = np.array([0.0, 0.0, -585.0, 0.0, 0.0, 0.0])
 
 def loaded_policy():
     """The linear arm's policy, whose estimators are exact for payloads on it."""
-    slope = -GAIN_M_PER_KPA.sum(axis=0) / (N * STRETCH_M_PER_KG)  # (n,) [kg / kPa]
-    weight = np.concatenate([np.full(N, 1.0 / (N * STRETCH_M_PER_KG)), slope])[:, None]
-    layer = np.float32(weight), np.full(1, -REST_M / STRETCH_M_PER_KG, np.float32)
+    effect = np.linalg.pinv(GAIN_M_PER_KPA) @ np.full(N, -STRETCH_M_PER_KG)  # (n,) [kPa / kg]
     sink = np.tile([0.0, 0.0, -SINK_M_PER_KG, 0.0, 0.0, 0.0], 3).astype(np.float32)
     per_load = np.zeros((2 * N + 1, 18), np.float32), sink
     return dataclasses.replace(
         POLICY,
-        load_estimator=POLICY.load_estimator._replace(layers=(layer,)),
+        load_estimator=load_estimator_of(SPEC, effect),
         estimator=POLICY.estimator._replace(load_layers=(per_load,)),
     )
 
@@ -199,13 +208,13 @@ def test_overload_and_what_no_payload_explains_are_reported(payload_kg, fault, l
 
 
 def test_a_payload_that_the_calibration_does_not_tell_is_not_believed():
-    unsure = ((np.zeros((2 * N, 1), np.float32), np.full(1, np.log(0.2), np.float32)),)
-    model = LOADED.load_estimator._replace(sd_layers=unsure)
+    known = LOADED.load_estimator.covariance_kpa2
+    model = LOADED.load_estimator._replace(covariance_kpa2=(0.2 / 0.05) ** 2 * known)
     run = follow(
         LoadedArm(0.6), Controller.of(dataclasses.replace(LOADED, load_estimator=model), plan_unloaded)
     )
     assert set(run.counts()) == {Fault.LOAD_UNKNOWN} and run.log.load_kg[-1] == 0.0
-    told = "payload not known better than 392 g, expected 300 g: record the poses of `python -m calib plan`"
+    told = "payload not known better than 401 g, expected 300 g: record the poses of `python -m calib plan`"
     assert told in run.events[0].message
 
 

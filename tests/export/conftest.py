@@ -14,7 +14,7 @@ from mjx_softarm.export import golden_cases
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
-from tests.linear_arm import SPEC, N, gain_of, make_policy
+from tests.linear_arm import SPEC, N, load_estimator_of, make_policy
 from tests.networks import s2r_of
 
 
@@ -39,10 +39,7 @@ def busy_policy(spec=SPEC):
         change_scale=np.full(6, 0.01, np.float32),
     )
     # 1 kPa less in every chamber than its springs show is half a kilogram
-    own = np.linalg.pinv(gain_of(spec)).mean(axis=0)
-    weight = 0.5 * np.concat([own, np.full(spec.n_chambers, -1.0 / spec.n_chambers)])[:, None]
-    bias = -0.5 * np.array([own @ spec.at_springs(spec.geometry.section_length_m)])
-    load = policy.load_estimator._replace(layers=((np.float32(weight), np.float32(bias)),))
+    load = load_estimator_of(spec, np.full(spec.n_chambers, -2.0))
     networks = {"estimator": estimator, "load_estimator": load, "s2r": s2r}
     return dataclasses.replace(policy, layers=layers(18, 12, n, scale=0.5), **networks)
 

@@ -1,10 +1,10 @@
 """Small networks for the arm's computer, distilled from the simulator: of load, pose and springs.
 
 The networks (`mjx_softarm.sensing.estimator`, `mjx_softarm.sensing.load`) learn equilibria over the whole
-workspace, and are tested on held-out ones. No calibration is perfect. So the load network learns from arms
-whose pressures differ from the calibrated arm's by draws of what its log leaves unknown
-(`mjx_softarm.sensing.held_pressures`), or whose chambers are off where there was no log. The pose network has
-no pressures as inputs: it would mistake a chamber's error for a change of shape.
+workspace, and are tested on held-out ones. No calibration is perfect. So the load network learns how well
+the log of the arm tells the pressures that hold it (`mjx_softarm.sensing.held_pressures`), or, without a log,
+by how much arms differ whose chambers are off. The pose network has no pressures as inputs: it would mistake
+a chamber's error for a change of shape.
 """
 
 from __future__ import annotations
@@ -34,26 +34,23 @@ from mjx_softarm.sensing.estimator import (
     estimate_frame,
     expected_springs,
 )
-from mjx_softarm.sensing.held_pressures import HeldPressures, held_kpa
+from mjx_softarm.sensing.held_pressures import HeldPressures, held_kpa, residual
 from mjx_softarm.sensing.load import (
     HIGHEST,
     LOWEST,
-    QUANTILE,
     LoadEstimator,
     estimate_load,
-    load_half_width,
+    holding,
 )
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 from train.runs.first_networks import first_estimator, first_load_estimator, first_spring_model
 
-N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 4_096, 2_048
+N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 2_048, 2_048
 MORE_PRESSURE = 0.25  # share of the pressure range that is added at either end
-N_DRAWS = 4  # of what a calibration leaves unknown, for each pose
 SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
-# Schedules for which the payload's network learns: on twin 0 it is then within 48 g (RMS) of generalised
-# least squares, after one within 68 g.
-LOAD_SCHEDULES = 3
+LOAD_SCHEDULES = 2  # schedules for which the payload's network learns
+PRESSURE_WEIGHT = 4.0  # of the pressures in its loss: they tell the payload more than its other outputs
 PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
@@ -98,7 +95,7 @@ def distil(spec: ArmSpec, seed: int, held: HeldPressures | None = None) -> Disti
     loaded = loaded_poses(spec, held, N_TRAINING, seed)
     estimator = _fit(first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
     estimator = _fit(estimator, _pose_loss, loaded, keys[2], "load_layers")
-    # Learn the load of arms that are off, and the springs of the unloaded arm.
+    # Learn what holds the arm, with a payload and without, and the springs of the unloaded arm.
     load_estimator = fit_load_estimator(spec, held, loaded, seed)
     unloaded = _as_measured(spec, held, sample_workspace(spec, N_TRAINING, seed))
     springs = _fit(first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
@@ -108,27 +105,59 @@ def distil(spec: ArmSpec, seed: int, held: HeldPressures | None = None) -> Disti
     return learned._replace(errors=_errors(learned, spec, held))
 
 
-def _as_measured(spec: ArmSpec, held: HeldPressures | None, pool: Any) -> Any:
-    """Return poses without a payload, with the pressures that hold the real arm as far as they are known."""
-    return _with_pressures(spec, held, pool, np.zeros_like(pool.pressure_kpa))
-
-
 def loaded_poses(spec: ArmSpec, held: HeldPressures | None, n: int, seed: int) -> LoadedPool:
-    """Draw n poses with payloads for the networks to learn from; see `distil`."""
+    """Draw n poses with payloads, of arms whose chambers are off if there was no log; see `distil`."""
     share = np.random.default_rng([seed, 1]).uniform(LOWEST, HIGHEST, CANDIDATES_PER_POSE * n)
-    return _loaded(spec, held, (spec.mass.payload_kg + spec.mass.largest_payload_kg) * share, seed)
+    many_kg = (spec.mass.payload_kg + spec.mass.largest_payload_kg) * share
+    return sample_loaded(spec, many_kg, CHAMBERS_OFF if held is None else 0.0, seed)
 
 
 def fit_load_estimator(
     spec: ArmSpec, held: HeldPressures | None, loaded: LoadedPool, seed: int
 ) -> LoadEstimator:
-    """Return the payload network of an arm, learned from `loaded_poses`; arguments as of `distil`."""
+    """Return the payload network of an arm, learned at the springs of `loaded_poses`; see `distil`."""
+    own_kg, most_kg = spec.mass.payload_kg, spec.mass.largest_payload_kg
+    n_sections = spec.structure.n_sections
+    # Pressures that hold the springs without a payload and with the largest one
+    arms = (spec.replace(mass={"payload_kg": own_kg + kg}) for kg in (0.0, most_kg))
+    light, heavy = (simulate_poses(arm, np.asarray(loaded.spring_m)) for arm in arms)
+    both = light.valid & heavy.valid
+    load_kg, kpa, spring_m = (np.asarray(values)[both] for values in loaded[:3])
+    light_kpa = light.pressure_kpa[both]
+    effect = (heavy.pressure_kpa[both] - light_kpa) / most_kg
+    # What the calibration knows of the real arm's pressures
+    if held is None:
+        off_kpa = (kpa - light_kpa - (load_kg - own_kg)[:, None] * effect).reshape(len(kpa), n_sections, -1)
+        covariance, share = (
+            np.einsum("nsi,nsj->sij", off_kpa, off_kpa) / len(kpa),
+            np.ones((len(kpa), n_sections)),
+        )
+    else:
+        covariance, share = held.covariance_kpa2, residual(held, spring_m, light_kpa).share
+    held_at_kpa = _held(spec, held, spring_m, light_kpa, np.zeros_like(effect))
+    # Learn, and judge by poses that are not learned
+    out = np.float32(np.concatenate([held_at_kpa, effect, np.log(share)], axis=1))
+    parts = np.split(spring_m, [-N_JUDGING]), np.split(out, [-N_JUDGING])
+    learned, judging = (_Holding(*map(jnp.asarray, part)) for part in zip(*parts, strict=True))
     keys = _keys(seed)
-    first = first_load_estimator(spec, loaded, keys[3])
-    learned = _fit(first, _load_loss, loaded, keys[4], n_schedules=LOAD_SCHEDULES)
-    # The error is learned from poses that the load network does not know, on which it is larger.
-    others = loaded_poses(spec, held, N_JUDGING, seed + 1)
-    return _fit(learned, _load_sd_loss, others, jax.random.fold_in(keys[4], 1), "sd_layers")
+    first = first_load_estimator(spec, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
+    network = _fit(first, _holding_loss, learned, keys[4], n_schedules=LOAD_SCHEDULES)
+    # The network's own error. It is larger at the rim, so the intervals of 95 % of these poses shall hold it.
+    found_kpa = holding(network, judging.spring_m).pressure_kpa
+    true_kpa = judging.out[:, : spec.n_chambers]
+    off_kpa = found_kpa - true_kpa.reshape(found_kpa.shape)
+    error = jnp.einsum("nsi,nsj->sij", off_kpa, off_kpa) / len(off_kpa)
+    alone = network._replace(covariance_kpa2=jnp.zeros_like(error), error_kpa2=error)
+    told_kg, half_width_kg = estimate_load(alone, judging.spring_m, true_kpa)
+    widened = jnp.quantile(jnp.abs(told_kg - own_kg) / half_width_kg, 0.95) ** 2
+    return network._replace(error_kpa2=widened * error)
+
+
+class _Holding(NamedTuple):
+    """Springs, and the outputs of `LoadEstimator` there."""
+
+    spring_m: Array  # (n, n_springs)
+    out: Array  # (n, n_out)
 
 
 def _keys(seed: int) -> Array:
@@ -143,25 +172,31 @@ def _loaded(spec: ArmSpec, held: HeldPressures | None, many_kg: np.ndarray, seed
     # The effect of the payload is the difference to the arm without it, held at the same springs.
     light = simulate_poses(spec, np.asarray(pool.spring_m))
     pool = jax.tree.map(lambda values: np.asarray(values)[light.valid], pool)
-    effect_kpa = pool.pressure_kpa - light.pressure_kpa[light.valid]
-    # Several draws for each pose, as a network would learn a single one by heart.
-    rng = np.random.default_rng([seed, 2])
-    drawn = [_with_pressures(spec, held, pool, effect_kpa, rng) for _ in range(N_DRAWS)]
-    return jax.tree.map(lambda *values: jnp.concatenate(values), *drawn)
+    light_kpa = light.pressure_kpa[light.valid]
+    rng, effect_kpa = np.random.default_rng([seed, 2]), pool.pressure_kpa - light_kpa
+    kpa = _held(spec, held, pool.spring_m, light_kpa, effect_kpa, rng)
+    return pool._replace(pressure_kpa=jnp.asarray(kpa, jnp.float32))
 
 
-def _with_pressures(
+def _as_measured(spec: ArmSpec, held: HeldPressures | None, pool: Any) -> Any:
+    """Return poses with the pressures that hold the real arm without a payload, as far as they are known."""
+    spring_m, kpa = np.asarray(pool.spring_m), np.asarray(pool.pressure_kpa)
+    return pool._replace(
+        pressure_kpa=jnp.asarray(_held(spec, held, spring_m, kpa, np.zeros_like(kpa)), jnp.float32)
+    )
+
+
+def _held(
     spec: ArmSpec,
     held: HeldPressures | None,
-    pool: Any,
+    spring_m: np.ndarray,
+    light_kpa: np.ndarray,
     effect_kpa: np.ndarray,
     rng: np.random.Generator | None = None,
-) -> Any:
-    """Return poses with the pressures that hold the real arm; see `held_kpa`."""
-    spring_m, kpa = np.asarray(pool.spring_m), np.asarray(pool.pressure_kpa)
-    if held is not None:
-        kpa = held_kpa(held, spring_m, kpa - effect_kpa, effect_kpa, rng)
-    return pool._replace(pressure_kpa=jnp.asarray(kpa + spec.unmodelled_kpa(spring_m), jnp.float32))
+) -> np.ndarray:
+    """Return the pressures that hold the real arm; see `held_kpa`."""
+    kpa = light_kpa + effect_kpa if held is None else held_kpa(held, spring_m, light_kpa, effect_kpa, rng)
+    return kpa + spec.unmodelled_kpa(spring_m)
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:
@@ -181,17 +216,13 @@ def _pose_loss(estimator: PoseEstimator, pool: LoadedPool) -> Array:
     return jnp.mean(away + TURN_MM**2 * turned)
 
 
-def _load_loss(estimator: LoadEstimator, pool: LoadedPool) -> Array:
-    """Return the mean square of the payload's error, as a share of the largest payload."""
-    off_kg = estimate_load(estimator, pool.spring_m, pool.pressure_kpa) - pool.load_kg
-    return jnp.mean((off_kg / estimator.load_scale_kg) ** 2)
-
-
-def _load_sd_loss(estimator: LoadEstimator, pool: LoadedPool) -> Array:
-    """Return the negative log-likelihood of the payload's errors, less a constant."""
-    off_kg = estimate_load(estimator, pool.spring_m, pool.pressure_kpa) - pool.load_kg
-    sd_kg = load_half_width(estimator, pool.spring_m, pool.pressure_kpa) / QUANTILE
-    return jnp.mean(0.5 * (off_kg / sd_kg) ** 2 + jnp.log(sd_kg))
+def _holding_loss(estimator: LoadEstimator, rows: _Holding) -> Array:
+    """Return the mean square of the outputs' errors, as shares of what a plane leaves."""
+    found = holding(estimator, rows.spring_m)
+    each = [x.reshape(len(rows.out), -1) for x in found]
+    off = (jnp.concatenate(each, axis=1) - rows.out) / estimator.out_scale
+    weight = jnp.ones(off.shape[1]).at[: each[0].shape[1]].set(PRESSURE_WEIGHT)
+    return jnp.mean(weight * off**2)
 
 
 def _spring_loss(model: SpringModel, pool: Pool) -> Array:
@@ -241,12 +272,12 @@ def _errors(learned: Distilled, spec: ArmSpec, held: HeldPressures | None) -> di
         springs = np.abs(expected_springs(learned.spring_model, pool.pressure_kpa) - pool.spring_m)
         # Estimate the load of arms whose chambers are off.
         off = _loaded(spec, held, many_kg, HELD_OUT_SEED)
-        seen = learned.load_estimator, off.spring_m, off.pressure_kpa
+        told_kg, half_width_kg = estimate_load(learned.load_estimator, off.spring_m, off.pressure_kpa)
         errors = {
             "tip_mm": 1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1),
             "turn_deg": np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))),
-            "load_kg": np.abs(np.asarray(estimate_load(*seen)) - load_kg),
-            "load_half_width_kg": np.asarray(load_half_width(*seen)),
+            "load_kg": np.abs(np.asarray(told_kg) - load_kg),
+            "load_half_width_kg": np.asarray(half_width_kg),
             "spring_mm": 1e3 * springs.max(axis=-1),
         }
         for name, values in errors.items():

@@ -15,7 +15,7 @@ from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.spec import ArmSpec
 
 WIDTH = 128  # width of the hidden layers
-SD_WIDTH = 32  # width of those of the payload's error
+LEAST_REST = 1e-6  # least scale of an output's rest: an arm without a log has one variance everywhere
 CHANGE_SCALE = 0.015  # scale of the pose network's outputs, in mean section lengths and half radians
 
 
@@ -42,15 +42,33 @@ def first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimato
     )
 
 
-def first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEstimator:
-    """Return the payload network of an arm, scaled by poses of it."""
-    n_in = spec.n_springs + spec.n_chambers
+def first_load_estimator(
+    spec: ArmSpec, spring_m: Array, out: Array, covariance_kpa2: Array, key: Array
+) -> LoadEstimator:
+    """Return the payload network of an arm, with the plane that fits its outputs best.
+
+    Args:
+        spec: the arm.
+        spring_m (n, n_springs) [m]: spring lengths.
+        out (n, n_out): outputs of `LoadEstimator` there.
+        covariance_kpa2 (n_sections, c, c): covariance of the residual pressures.
+        key: key of the weights.
+    """
+    scaling, centre = _scaling("spring", "m", spring_m), jnp.mean(out, axis=0)
+    springs = (spring_m - scaling["spring_centre_m"]) / scaling["spring_scale_m"]
+    slope = jnp.linalg.lstsq(springs, out - centre)[0]
+    rest = jnp.std(out - centre - springs @ slope, axis=0)
+    (n_in, n_out), own_kg = slope.shape, spec.mass.payload_kg
     return LoadEstimator(
-        layers=initial_layers(key, (n_in, WIDTH, WIDTH, 1)),
-        sd_layers=initial_layers(jax.random.fold_in(key, 1), (n_in, SD_WIDTH, SD_WIDTH, 1)),
-        **_scaling("spring", "m", pool.spring_m),
-        **_scaling("pressure", "kpa", pool.pressure_kpa),
-        load_scale_kg=jnp.asarray(spec.mass.payload_kg + spec.mass.largest_payload_kg),
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
+        slope=slope,
+        **scaling,
+        out_centre=centre,
+        out_scale=jnp.maximum(rest, LEAST_REST),
+        covariance_kpa2=covariance_kpa2,
+        error_kpa2=jnp.zeros_like(covariance_kpa2),
+        own_load_kg=jnp.asarray(own_kg),
+        load_scale_kg=jnp.asarray(own_kg + spec.mass.largest_payload_kg),
     )
 
 
