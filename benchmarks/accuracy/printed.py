@@ -54,21 +54,21 @@ DISCOUNT = ("learner.gamma=0.5",)
 ON_LOGIT = ("learner.gail.penalty_on=logit",)
 AT_AGENT = ("learner.expert_start=agent",)
 CASES = {
-    "circle, learned": Case("circle16"),
-    "circle, hand-made": Case("circle16", HAND_MADE),
-    "pipe, learned": Case("pipe300"),
-    "pipe, hand-made": Case("pipe300", HAND_MADE),
+    "circle-learned": Case("circle16"),
+    "circle-hand-made": Case("circle16", HAND_MADE),
+    "pipe-learned": Case("pipe300"),
+    "pipe-hand-made": Case("pipe300", HAND_MADE),
     # One change each.
-    "circle, hand-made, near goals": Case("circle16", (*HAND_MADE, *NEAR), True),
-    "circle, hand-made, exchange": Case("circle16", (*HAND_MADE, *EXCHANGE), True),
-    "circle, hand-made, discount": Case("circle16", (*HAND_MADE, *DISCOUNT), True),
-    "circle, hand-made, all three": Case("circle16", (*HAND_MADE, *NEAR, *EXCHANGE, *DISCOUNT), True),
-    "circle, learned, discount": Case("circle16", DISCOUNT, True),
-    "circle, learned, penalty on the logit": Case("circle16", ON_LOGIT, True),
-    "circle, learned, expert at the agent's state": Case("circle16", AT_AGENT, True),
-    "circle, learned, all three": Case("circle16", (*DISCOUNT, *ON_LOGIT, *AT_AGENT), True),
+    "circle-hand-made-near-goals": Case("circle16", (*HAND_MADE, *NEAR), True),
+    "circle-hand-made-exchange": Case("circle16", (*HAND_MADE, *EXCHANGE), True),
+    "circle-hand-made-discount": Case("circle16", (*HAND_MADE, *DISCOUNT), True),
+    "circle-hand-made-all-three": Case("circle16", (*HAND_MADE, *NEAR, *EXCHANGE, *DISCOUNT), True),
+    "circle-learned-discount": Case("circle16", DISCOUNT, True),
+    "circle-learned-penalty-on-the-logit": Case("circle16", ON_LOGIT, True),
+    "circle-learned-expert-at-the-agents-state": Case("circle16", AT_AGENT, True),
+    "circle-learned-all-three": Case("circle16", (*DISCOUNT, *ON_LOGIT, *AT_AGENT), True),
     # The penalty's effect on the losses.
-    "circle, learned, no penalty": Case("circle16", ("learner.gail.gradient_penalty=0",), True),
+    "circle-learned-no-penalty": Case("circle16", ("learner.gail.gradient_penalty=0",), True),
 }
 
 
@@ -135,7 +135,7 @@ def demos_file(task: str) -> str:
 
 def run_name(case: str, seed: int) -> str:
     """Return the name of a run's folder."""
-    return f"{case.replace(',', '').replace(' ', '-').replace(chr(39), '')}-seed{seed}"
+    return f"{case}-seed{seed}"
 
 
 def demonstrate(folder: Path, settings: PrintedSettings, task: str) -> None:
@@ -259,7 +259,7 @@ def curves_figure(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) 
     for panel, task in zip(panels[0], ("circle", "pipe"), strict=False):
         plots.dress(panel, f"{task}: demonstrated positions with success", plots.STEPS, "%")
         for colour, reward in zip((plots.BLUE, plots.ORANGE), ("learned", "hand-made"), strict=True):
-            if (name := f"{task}, {reward}") in metrics:
+            if (name := f"{task}-{reward}") in metrics:
                 curve = curves({name: metrics[name]})[name]
                 percent = np.array(curve["success_percent"])
                 panel.plot(curve["env_steps"], percent.mean(axis=0), color=colour, label=f"{reward} reward")
@@ -269,11 +269,11 @@ def curves_figure(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) 
         panel.legend(frameon=False)
     panels[0][2].set_axis_off()
     # Losses, of the first seed.
-    penalties = {"": "on D, as printed", ", penalty on the logit": "on the logit", ", no penalty": "none"}
+    penalties = {"": "on D, as printed", "-penalty-on-the-logit": "on the logit", "-no-penalty": "none"}
     for panel, (key, title) in zip(panels[1], LOSSES.items(), strict=True):
         plots.dress(panel, f"circle, learned: {title}", plots.STEPS, "")
         for k, (change, label) in enumerate(penalties.items()):
-            if runs := metrics.get(f"circle, learned{change}"):
+            if runs := metrics.get(f"circle-learned{change}"):
                 rows = [row for row in runs[0] if row["updates"]]
                 steps = [row["env_steps"] for row in rows]
                 panel.plot(steps, [row[key] for row in rows], color=colormaps["tab10"](k), label=label)

@@ -25,6 +25,7 @@ def course(success, median_mm=5.0, losses=(4.0, 4.0, 2.0, 2.0, 1.0, 1.0)):
 
 
 def test_every_case_is_a_preset_of_the_paper_with_other_settings():
+    assert not any("," in name for name in CASES)  # --cases takes NAME,NAME,...
     names = [run_name(name, 0) for name in CASES]
     assert len(set(names)) == len(names) and not any(set(" ,'") & set(name) for name in names)
     configs = [override(IMITATION_PRESETS[PRESETS[c.task]], c.settings) for c in CASES.values()]
@@ -62,11 +63,11 @@ def test_a_training_resumes_what_there_is(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(printed, "command", lambda log, *words: calls.append(words))
     settings = printed.PrintedSettings(env_steps=600_000)
-    printed.train(tmp_path, settings, "pipe, hand-made", 1)
+    printed.train(tmp_path, settings, "pipe-hand-made", 1)
     run = tmp_path / "pipe-hand-made-seed1"
     run.mkdir()
     (run / "config.json").touch()
-    printed.train(tmp_path, settings, "pipe, hand-made", 1)
+    printed.train(tmp_path, settings, "pipe-hand-made", 1)
     new, resumed = calls
     assert resumed == ("imitate", "--resume", str(run))
     assert new[:4] == ("imitate", str(tmp_path / "demos/pipe300.npz"), "--preset", "paper-pipe")
@@ -75,9 +76,9 @@ def test_a_training_resumes_what_there_is(tmp_path, monkeypatch):
 
 def test_figures_are_over_the_seeds_of_a_case():
     runs = [course((0.0, 0.5)), course((0.25, 1.0), median_mm=3.0)]
-    row = over_seeds("circle, learned", runs, [{"circle_mm": 2.0}, {"circle_mm": 2.0}])
+    row = over_seeds("circle-learned", runs, [{"circle_mm": 2.0}, {"circle_mm": 2.0}])
     assert row == {
-        "case": "circle, learned",
+        "case": "circle-learned",
         "seeds": 2,
         "env_steps": 600,
         "updates": 50,
@@ -85,15 +86,15 @@ def test_figures_are_over_the_seeds_of_a_case():
         "median_mm": "4 (3 to 5)",
         "circle_mm": "2",
     }
-    assert curves({"circle, learned": runs}) == {
-        "circle, learned": {"env_steps": [300, 600], "success_percent": [[0.0, 50.0], [25.0, 100.0]]}
+    assert curves({"circle-learned": runs}) == {
+        "circle-learned": {"env_steps": [300, 600], "success_percent": [[0.0, 50.0], [25.0, 100.0]]}
     }
 
 
 def test_losses_begin_with_the_first_update():
-    first, *_ = loss_rows("circle, learned", course((0.0, 1.0), losses=(9.0, 4.0, 2.0, 2.0, 1.0, 1.5)))
+    first, *_ = loss_rows("circle-learned", course((0.0, 1.0), losses=(9.0, 4.0, 2.0, 2.0, 1.0, 1.5)))
     assert first == {
-        "case": "circle, learned",
+        "case": "circle-learned",
         "loss": "critics' loss",
         "first tenth": 4.0,
         "last tenth": 1.5,
