@@ -45,13 +45,13 @@ class Case(NamedTuple):
 CLEARANCE = ("env.clearance_cost_per_mm=1",)
 ALONE = (*BOTH, "learner.hand_made_weight=0")
 CASES = {
-    "lips, learned": Case("lip300"),
-    "lips, hand-made": Case("lip300", HAND_MADE),
-    "lips, hand-made, clearance": Case("lip300", (*HAND_MADE, *CLEARANCE)),
-    "lips, both": Case("lip300", BOTH),
-    "narrow lips, learned in wide ones": Case("lip250", ALONE, reward_of="lips, learned"),
-    "200 mm, learned": Case("pipe200"),
-    "200 mm, hand-made": Case("pipe200", HAND_MADE),
+    "lips-learned": Case("lip300"),
+    "lips-hand-made": Case("lip300", HAND_MADE),
+    "lips-hand-made-clearance": Case("lip300", (*HAND_MADE, *CLEARANCE)),
+    "lips-both": Case("lip300", BOTH),
+    "narrow-lips-learned-in-wide-ones": Case("lip250", ALONE, reward_of="lips-learned"),
+    "200-mm-learned": Case("pipe200"),
+    "200-mm-hand-made": Case("pipe200", HAND_MADE),
 }
 
 
@@ -135,7 +135,7 @@ def _export(twin: int, names: list[str]) -> WorkStage:
 
 def run_name(case: str, twin: int, seed: int) -> str:
     """Return the folder of a run."""
-    return f"{case.replace(', ', '-').replace(' ', '-')}-twin{twin}-seed{seed}"
+    return f"{case}-twin{twin}-seed{seed}"
 
 
 def trial_file(case: str, twin: int, seed: int, variant: str) -> str:
@@ -212,7 +212,7 @@ def summary(case: str, variant: str, rows: Sequence[Mapping[str, Any]]) -> dict[
 def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the targets that were set before the measurement, and whether they are met."""
     found = []
-    for case, least in (("lips, learned", 9), ("narrow lips, learned in wide ones", 8)):
+    for case, least in (("lips-learned", 9), ("narrow-lips-learned-in-wide-ones", 8)):
         own = [row for row in rows if row["case"] == case and row["objects"] == VARIANTS[0]]
         calm = sum(row["done"] == N_OPERATIONS and row["wall_max_n"] <= CALM_N for row in own)
         text = f"{case}: all operations at no more than {CALM_N:g} N in {least} of 9 runs"

@@ -35,6 +35,19 @@ from train.runs.run import task_of_run
 PICTURE = "printed.png"
 N_POINTS = 40  # of the circle that a policy of its 16 demonstrated points follows
 PRESETS = {"circle16": "paper-circle", "pipe300": "paper-pipe"}
+# Panels of the picture, and the cases in it: task, figure and title; case and label
+PANELS = (
+    ("circle", "median_mm", "median error [mm]"),
+    ("circle", "success_share", "share of the positions with success"),
+    ("pipe", "success_share", "share of the positions with success"),
+)
+SHOWN = {
+    "learned": "learned",
+    "hand-made": "hand-made",
+    "learned-all-three": "learned, three changes",
+    "hand-made-all-three": "hand-made, three changes",
+    "hand-made-near-goals": "hand-made, near goals",
+}
 LOSSES = {"tqc/critic_loss": "critics' loss", "tqc/actor_loss": "actor's loss"}
 LOSSES |= {"gail/discriminator_loss": "discriminator's loss"}
 
@@ -252,22 +265,29 @@ def loss_rows(name: str, rows: Sequence[Mapping[str, float]]) -> list[dict[str, 
 
 
 def curves_figure(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
-    """Draw success over env steps on circle and in the pipe, and the losses with and without the penalty."""
+    """Draw errors and success over env steps, and the losses with and without the penalty."""
     figure = Figure(figsize=(12, 7), layout="constrained")
     panels = figure.subplots(2, 3)
-    # Success: mean over the seeds, with a band.
-    for panel, task in zip(panels[0], ("circle", "pipe"), strict=False):
-        plots.dress(panel, f"{task}: demonstrated positions with success", plots.STEPS, "%")
-        for colour, reward in zip((plots.BLUE, plots.ORANGE), ("learned", "hand-made"), strict=True):
-            if (name := f"{task}-{reward}") in metrics:
-                curve = curves({name: metrics[name]})[name]
-                percent = np.array(curve["success_percent"])
-                panel.plot(curve["env_steps"], percent.mean(axis=0), color=colour, label=f"{reward} reward")
-                band = percent.min(axis=0), percent.max(axis=0)
-                panel.fill_between(curve["env_steps"], *band, color=colour, alpha=0.2, linewidth=0)
-        panel.set_ylim(-2, 102)
-        panel.legend(frameon=False)
-    panels[0][2].set_axis_off()
+    # Both rewards as printed, over the seeds, and with the changes that reach goals.
+    for panel, (task, key, title) in zip(panels[0], PANELS, strict=True):
+        cases = {name: runs for name, runs in metrics.items() if name.startswith(task)}
+        if not cases:
+            panel.set_axis_off()
+            continue
+        plots.dress(panel, f"{task}: {title}", plots.STEPS, "")
+        for k, (name, change) in enumerate(SHOWN.items()):
+            if runs := cases.get(f"{task}-{name}"):
+                rows = [[row for row in run if f"evaluation/{key}" in row] for run in runs]
+                steps, values = (
+                    np.array([[row[x] for row in run] for run in rows])
+                    for x in ("env_steps", f"evaluation/{key}")
+                )
+                panel.plot(steps[0], values.mean(axis=0), color=colormaps["tab10"](k), label=change)
+                panel.fill_between(
+                    steps[0], values.min(axis=0), values.max(axis=0), color=colormaps["tab10"](k), alpha=0.2
+                )
+        panel.set_yscale("log" if key == "median_mm" else "linear")
+    panels[0][0].legend(frameon=False)
     # Losses, of the first seed.
     penalties = {"": "on D, as printed", "-penalty-on-the-logit": "on the logit", "-no-penalty": "none"}
     for panel, (key, title) in zip(panels[1], LOSSES.items(), strict=True):
@@ -277,6 +297,6 @@ def curves_figure(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) 
                 rows = [row for row in runs[0] if row["updates"]]
                 steps = [row["env_steps"] for row in rows]
                 panel.plot(steps, [row[key] for row in rows], color=colormaps["tab10"](k), label=label)
-        panel.set_yscale("symlog")
-        panel.legend(frameon=False, title="gradient penalty")
+        panel.set_yscale("linear" if "discriminator" in title else "symlog")
+    panels[1][0].legend(frameon=False, title="gradient penalty")
     return figure

@@ -105,6 +105,9 @@ def test_losses_begin_with_the_first_update():
 def test_success_and_losses_are_drawn():
     metrics = {name: [course((0.0, 0.5))] * 2 for name in CASES}
     figure = curves_figure(metrics)
-    circle, pipe, _, *losses = figure.axes
-    assert [len(panel.lines) for panel in (circle, pipe, *losses)] == [2, 2, 3, 3, 3]
+    error, success, pipe, *losses = figure.axes
+    assert [len(panel.lines) for panel in (error, success, pipe, *losses)] == [5, 5, 2, 3, 3, 3]
+    assert error.get_yscale() == "log"
+    without = curves_figure({name: runs for name, runs in metrics.items() if "pipe" not in name})
+    assert not without.axes[2].axison
     assert [line.get_label() for line in losses[0].lines] == ["on D, as printed", "on the logit", "none"]
