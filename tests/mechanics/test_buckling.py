@@ -1,11 +1,11 @@
 """Arms that stand: what buckles says so, and what the law holds is where C MuJoCo's arm comes to rest."""
 
+import functools
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from benchmarks.speed.mujoco_arms import SteppedArms, sensed_model
 from benchmarks.speed.truth import random_references
@@ -26,23 +26,29 @@ def loaded(payload_kg):
     return STANDING.replace(mass={"payload_kg": payload_kg})
 
 
-def least_curvature(spec, found, rows):
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0, None))
+def curvature(q, pressure, params):
+    hessian = statics(chain_kinematics(params)(q), q, pressure, params).hessian.dense()
+    root = jnp.sqrt(params.joint_stiffness)
+    return jnp.linalg.eigvalsh(hessian / root / root[:, None])[0]
+
+
+def least_curvature(spec, found):
     """The least eigenvalue of the potential's Hessian at constant pressures, by the joints' own stiffness."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, np.float64))
-
-    def curvature(q, pressure):
-        hessian = statics(chain_kinematics(params)(q), q, pressure, params).hessian.dense()
-        root = jnp.sqrt(params.joint_stiffness)
-        return jnp.linalg.eigvalsh(hessian / root / root[:, None])[0]
-
-    arms = zip(found.q[rows], found.pressure_kpa[rows], strict=True)
-    return np.array([curvature(*map(jnp.float64, arm)) for arm in arms])
+    return np.asarray(curvature(jnp.float64(found.q), jnp.float64(found.pressure_kpa), params))
 
 
-def settled(spec, reference_m, dtype=np.float64):
-    params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
-    solve = jax.jit(jax.vmap(lambda target: settle(chain_kinematics(params), params, target)))
-    return jax.device_get(solve(jnp.asarray(reference_m, dtype)))
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, None))
+def solve(reference, params):
+    return settle(chain_kinematics(params), params, reference)
+
+
+def settled(spec, reference_m):
+    params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, np.float32))
+    return jax.device_get(solve(jnp.float32(reference_m), params))
 
 
 def test_no_arm_that_would_buckle_settles_at_constant_pressures():
@@ -54,16 +60,16 @@ def test_no_arm_that_would_buckle_settles_at_constant_pressures():
     assert found.result[0] == SettleResult.NOT_CONVEX
     assert 0.2 < found.settled.mean() < 0.9
     with jax.enable_x64(True):
-        assert (least_curvature(spec, found, found.settled) > 0.0).all()
+        assert (least_curvature(spec, found)[found.settled] > 0.0).all()
 
 
 def test_the_law_holds_arms_that_would_buckle_where_c_mujoco_holds_them():
     spec = loaded(0.01)
     reference_m = random_references(spec, N)
-    found = settled(spec, reference_m, np.float32)
+    found = settled(spec, reference_m)
     assert found.settled.all()
     with jax.enable_x64(True):
-        assert (least_curvature(spec, found, slice(None)) < 0.0).mean() > 0.3
+        assert (least_curvature(spec, found) < 0.0).mean() > 0.3
     tips_mm = SteppedArms(sensed_model(spec), spec, N, 1).hold(reference_m, 12.0)
     away = np.linalg.norm(1e3 * found.tip_position_m - tips_mm[-1], axis=1)
     assert away.max() < 0.05
@@ -71,41 +77,46 @@ def test_the_law_holds_arms_that_would_buckle_where_c_mujoco_holds_them():
 
 def test_the_paper_s_arm_is_too_heavy_to_stand_and_says_so():
     spec = ArmSpec.default().replace(mounting=UP)
-    found = settled(spec, random_references(spec, N), np.float32)
+    found = settled(spec, random_references(spec, N))
     assert set(found.result) <= {SettleResult.NOT_CONVEX, SettleResult.OUT_OF_ITERATIONS}
 
 
-@pytest.mark.parametrize("of", ["reference", "stiffness"])
-def test_derivatives_of_arms_that_the_law_holds_are_those_of_differences(of):
+def test_derivatives_of_arms_that_the_law_holds_are_those_of_differences():
+    """By the references, and by the chambers' stiffness."""
     with jax.enable_x64(True):
         params = jax.tree.map(jnp.asarray, ArmParams.from_spec(loaded(0.03), np.float64))
         reference_m = jnp.asarray(random_references(STANDING, 4))
 
         def tips(change):
-            arm, target = params, reference_m
-            if of == "reference":
-                target = reference_m + 1e-3 * change
-            else:
-                arm = params._replace(chamber_stiffness=params.chamber_stiffness * (1.0 + 0.01 * change))
-            return jax.vmap(lambda x: settle(chain_kinematics(arm), arm, x))(target)
+            """Arms whose references [mm] and stiffnesses [%] change by (2, 9)."""
+            arm = params._replace(chamber_stiffness=params.chamber_stiffness * (1.0 + 0.01 * change[1]))
+            hold = functools.partial(settle, chain_kinematics(arm), arm)
+            return jax.vmap(hold)(reference_m + 1e-3 * change[0])
 
-        found = tips(jnp.zeros(9))
-        assert found.settled.any() and not (least_curvature(loaded(0.03), found, found.settled) > 0.0).any()
-        direction, step = jnp.asarray(np.random.default_rng(1).normal(size=9)), 1e-4
-        _, slope = jax.jvp(lambda x: tips(x).tip_position_m, (jnp.zeros(9),), (direction,))
-        ahead, back = (tips(sign * step * direction).tip_position_m for sign in (1.0, -1.0))
-        expected = (ahead - back) / (2 * step)
-    np.testing.assert_allclose(slope[found.settled], expected[found.settled], rtol=1e-3, atol=1e-6)
+        def along(direction):
+            return jax.jvp(lambda x: tips(x).tip_position_m, (jnp.zeros((2, 9)),), (direction,))[1]
+
+        # Both directions; arms without a change, and a step ahead and back along each
+        direction, step = jnp.eye(2)[:, :, None] * np.random.default_rng(1).normal(size=9), 1e-4
+        change = jnp.concatenate([jnp.zeros((1, 2, 9)), step * direction, -step * direction])
+        arms = jax.jit(jax.vmap(tips))(change)
+        found = jax.tree.map(lambda x: x[0], arms)
+        curved = least_curvature(loaded(0.03), found)
+        slope = jax.jit(jax.vmap(along))(direction)  # (2, 4, 3)
+        expected = (arms.tip_position_m[1:3] - arms.tip_position_m[3:]) / (2 * step)
+    assert found.settled.any() and not (curved[found.settled] > 0.0).any()
+    np.testing.assert_allclose(slope[:, found.settled], expected[:, found.settled], rtol=1e-3, atol=1e-6)
+    assert (np.abs(slope).max(axis=(1, 2)) > 3e-5).all()  # [m] by a millimetre, by a percent
 
 
 def test_arms_that_stand_are_drawn_with_payloads_under_which_they_would_buckle():
     pool = sample_loaded(STANDING, np.full(2 * N, 0.02), 0.0, seed=0)
-    found = settled(loaded(0.02), pool.spring_m, np.float32)
+    found = settled(loaded(0.02), pool.spring_m)
     assert found.settled.mean() > 0.8
     away_mm = 1e3 * found.tip_position_m - np.asarray(pool.pose)[:, :3]
     assert np.abs(away_mm[found.settled]).max() < 0.1
     with jax.enable_x64(True):
-        assert (least_curvature(loaded(0.02), found, found.settled) < 0.0).mean() > 0.3
+        assert (least_curvature(loaded(0.02), found)[found.settled] < 0.0).mean() > 0.3
 
 
 def test_the_law_holds_no_arm_behind_regulators(spec):
