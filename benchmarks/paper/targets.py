@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.harness.common import target
 from benchmarks.paper.measure import CALM_N
 from benchmarks.paper.summary import HEAVY_G, LIGHT_G, Row, all_done
+from mjx_softarm.deploy.safety import Fault
 
 CALM_PERCENT = 99.0
 WIDE_RUNS, NARROW_RUNS, OF_RUNS = 8, 7, 9  # for other numbers of runs, the same share
@@ -61,11 +62,18 @@ def _open(table: Sequence[Row]) -> list[Check]:
 def _loaded(how: str, rows: Sequence[Row]) -> list[Check]:
     """Check the targets for payloads; the policies are those of `rows`."""
     light, heavy = ([row for row in rows if row["load_g"] == load_g] for load_g in (LIGHT_G, HEAVY_G))
+    overloaded = sum(Fault.OVERLOADED.value in row["events"] for row in heavy)
     return [
         _at_most(f"{LIGHT_G} g{how}, mean translation", "mm", 2.5, light, "translation_mm"),
         _at_most(f"1 kg{how}, mean translation", "mm", 4.0, heavy, "translation_mm"),
         _at_most(f"1 kg{how}, largest translation of all runs", "mm", 12.0, heavy, "max_mm", np.max),
         _at_most(f"payload{how}, estimated, mean error at all loads", "g", 100.0, rows, "load_off_g"),
+        _check(
+            f"1 kg{how}, the largest payload: no run told to be overloaded",
+            f"{overloaded} of {len(heavy)} runs",
+            not overloaded,
+            heavy,
+        ),
     ]
 
 

@@ -7,6 +7,7 @@ import pytest
 from benchmarks.paper.kinds import Trial
 from benchmarks.paper.targets import check_targets
 from benchmarks.paper.trials import trials
+from mjx_softarm.deploy.safety import Fault
 from tests.benchmarks.paper.made_up import FULL, TINY, good_results, made_up, pipe_trial, tables, trained
 
 X, Y, Z = (f"300 mm pipe: mean absolute error in {a} at the goals at most 5 mm" for a in "XYZ")
@@ -35,7 +36,7 @@ def unmet(experiment, changed=None):
     return [row["target"] for row in checks(experiment, changed) if row["verdict"] != "met"]
 
 
-@pytest.mark.parametrize(("experiment", "n"), [("open", 13), ("confined", 12)])
+@pytest.mark.parametrize(("experiment", "n"), [("open", 14), ("confined", 12)])
 def test_targets_that_are_met(experiment, n):
     assert unmet(experiment) == []
     assert len(checks(experiment)) == n
@@ -46,6 +47,14 @@ RATIO = "translation with calibrated springs over that with S2R, at least 2"
 FREE = "with S2R, unloaded: no saturated"
 ANGLES = [f"with S2R, mean {angle} at most 3 deg" for angle in ("yaw", "pitch", "roll")]
 ALL_UNLOADED = [TRANSLATION, *ANGLES, RATIO, "payload, estimated", FREE, REACHED]
+
+
+def test_an_overload_that_is_told_with_the_largest_payload_is_missed():
+    told = made_up("with", (1.0,), estimate_g=1000)
+    told.events[list(Fault).index(Fault.OVERLOADED)] = 1
+    assert unmet("open", {AT_1_KG: told}) == ["1 kg, the largest payload: no run told to be overloaded"]
+    with_500_g = {UNLOADED._replace(load_g=500): told._replace(load_estimate_g=told.load_estimate_g - 500)}
+    assert unmet("open", with_500_g) == []
 
 
 @pytest.mark.parametrize(
@@ -72,7 +81,7 @@ def test_targets_for_payloads_are_those_of_a_policy_that_observes_it_too():
     worst = {Trial("payload", 1, 0, load_g=1000): made_up("payload", (12.1,), estimate_g=1000)}
     for changed, missed in ((None, []), (worst, ["1 kg observed, m", "1 kg observed, l"])):
         found = check_targets("open", *tables(good_results("open", settings, changed)))
-        assert len(found) == 13 + 4
+        assert len(found) == 14 + 5
         texts = [row["target"] for row in found if row["verdict"] != "met"]
         assert len(texts) == len(missed)
         assert all(text.startswith(target) for text, target in zip(texts, missed, strict=True))
