@@ -45,12 +45,17 @@ class PayloadPoses(NamedTuple):
 def payload_poses(spec: ArmSpec, n: int = N_POSES, seed: int = SEED) -> PayloadPoses:
     """Return poses at n random pressures, without those at which the arm does not settle."""
     found = settle_many(spec, random_pressures(spec, n, seed))
-    spring_m, payload_kg = np.asarray(found.spring_m)[found.settled], spec.mass.largest_payload_kg
-    loaded = spec.replace(mass={"payload_kg": spec.mass.payload_kg + payload_kg})
-    light, heavy = (simulate_poses(arm, spring_m) for arm in (spec, loaded))
-    both = light.valid & heavy.valid
+    at, both = held_at(spec, np.asarray(found.spring_m)[found.settled])
+    return PayloadPoses(*(values[both] for values in at))
+
+
+def held_at(spec: ArmSpec, spring_m: np.ndarray) -> tuple[PayloadPoses, np.ndarray]:
+    """Return springs (m, n_springs) [m] with what holds them, and a mask (m,) of those that are held."""
+    own_kg, payload_kg = spec.mass.payload_kg, spec.mass.largest_payload_kg
+    arms = (spec.replace(mass={"payload_kg": own_kg + kg}) for kg in (0.0, payload_kg))
+    light, heavy = (simulate_poses(arm, spring_m) for arm in arms)
     effect = (heavy.pressure_kpa - light.pressure_kpa) / payload_kg
-    return PayloadPoses(spring_m[both], light.pressure_kpa[both], effect[both])
+    return PayloadPoses(spring_m, light.pressure_kpa, effect), light.valid & heavy.valid
 
 
 def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float) -> np.ndarray:
@@ -95,12 +100,9 @@ def told_payload(
         spring_m (m, n_springs) [m]: spring lengths.
         pressure_kpa (m, n_chambers) [kPa]: measured pressures.
     """
-    own_kg, largest_kg = spec.mass.payload_kg, spec.mass.largest_payload_kg
-    arms = (spec.replace(mass={"payload_kg": own_kg + kg}) for kg in (0.0, largest_kg))
-    light_kpa, heavy_kpa = (simulate_poses(arm, spring_m).pressure_kpa for arm in arms)
-    effect = (heavy_kpa - light_kpa) / largest_kg
-    found, at = residual(held, spring_m, light_kpa), PayloadPoses(spring_m, light_kpa, effect)
-    left_kpa = pressure_kpa - light_kpa - found.mean_kpa.reshape(light_kpa.shape)
+    at, _ = held_at(spec, spring_m)
+    effect, found = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
+    left_kpa = pressure_kpa - at.pressure_kpa - found.mean_kpa.reshape(effect.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
     for _ in range(2):
         weight = np.linalg.solve(_covariance(held, at, payload_kg), effect[..., None])[..., 0]

@@ -17,8 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from calib.fit.payload import held_at
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.training import Schedule, train_network
+from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.mechanics.workspace import (
     CANDIDATES_PER_POSE,
     HELD_OUT_SEED,
@@ -116,20 +118,16 @@ def fit_load_estimator(
     spec: ArmSpec, held: HeldPressures | None, loaded: LoadedPool, seed: int
 ) -> LoadEstimator:
     """Return the payload network of an arm, learned at the springs of `loaded_poses`; see `distil`."""
-    own_kg, most_kg = spec.mass.payload_kg, spec.mass.largest_payload_kg
-    n_sections = spec.structure.n_sections
-    # Pressures that hold the springs without a payload and with the largest one
-    arms = (spec.replace(mass={"payload_kg": own_kg + kg}) for kg in (0.0, most_kg))
-    light, heavy = (simulate_poses(arm, np.asarray(loaded.spring_m)) for arm in arms)
-    both = light.valid & heavy.valid
-    load_kg, kpa, spring_m = (np.asarray(values)[both] for values in loaded[:3])
-    light_kpa = light.pressure_kpa[both]
-    effect = (heavy.pressure_kpa[both] - light_kpa) / most_kg
+    own_kg, n_sections = spec.mass.payload_kg, spec.structure.n_sections
+    # Pressures that hold the springs without a payload, and their change by one
+    at, both = held_at(spec, np.asarray(loaded.spring_m))
+    spring_m, light_kpa, effect = (values[both] for values in at)
     # What the calibration knows of the real arm's pressures
     if held is None:
-        off_kpa = (kpa - light_kpa - (load_kg - own_kg)[:, None] * effect).reshape(len(kpa), n_sections, -1)
+        load_kg, kpa = (np.asarray(values)[both] for values in loaded[:2])
+        off_kpa = kpa - light_kpa - (load_kg - own_kg)[:, None] * effect
         covariance, share = (
-            np.einsum("nsi,nsj->sij", off_kpa, off_kpa) / len(kpa),
+            _square(off_kpa.reshape(len(kpa), n_sections, -1)),
             np.ones((len(kpa), n_sections)),
         )
     else:
@@ -145,8 +143,7 @@ def fit_load_estimator(
     # The network's own error. It is larger at the rim, so the intervals of 95 % of these poses shall hold it.
     found_kpa = holding(network, judging.spring_m).pressure_kpa
     true_kpa = judging.out[:, : spec.n_chambers]
-    off_kpa = found_kpa - true_kpa.reshape(found_kpa.shape)
-    error = jnp.einsum("nsi,nsj->sij", off_kpa, off_kpa) / len(off_kpa)
+    error = _square(found_kpa - true_kpa.reshape(found_kpa.shape))
     alone = network._replace(covariance_kpa2=jnp.zeros_like(error), error_kpa2=error)
     told_kg, half_width_kg = estimate_load(alone, judging.spring_m, true_kpa)
     widened = jnp.quantile(jnp.abs(told_kg - own_kg) / half_width_kg, 0.95) ** 2
@@ -158,6 +155,12 @@ class _Holding(NamedTuple):
 
     spring_m: Array  # (n, n_springs)
     out: Array  # (n, n_out)
+
+
+def _square(off_kpa: Any) -> Any:
+    """Return the mean squares (s, c, c) of pressures (n, s, c) that are off."""
+    xp = array_namespace(off_kpa)
+    return xp.einsum("nsi,nsj->sij", off_kpa, off_kpa) / len(off_kpa)
 
 
 def _keys(seed: int) -> Array:
