@@ -20,7 +20,7 @@ from mjx_softarm.control import Allocation, Gains, allocated_error, at_chambers,
 from mjx_softarm.deploy.controller import LOOP, Command, Controller, LoopConfig
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
-from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load
+from mjx_softarm.sensing.load import Load, averaged, estimate_load, holds_payload
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 
 _NO_EFFECT_M2 = 1e-18
@@ -145,13 +145,13 @@ def _weighed(
 ) -> tuple[Load, float, float]:
     """Return the averaged payload, this window's estimate [kg] and the half-width [kg] of its interval.
 
-    The estimate takes mean springs and pressures at rest. An estimate that is no payload leaves the specified
-    payload, and so does a first one that is not known well.
+    The estimate takes mean springs and pressures at rest. An estimate whose interval holds no payload leaves
+    the specified payload, and so does a first one that is not known well.
     """
     model = controller.policy.load_estimator
     most_kg = float(model.load_scale_kg)
     estimate_kg, width_kg = map(float, estimate_load(model, mean_m, mean_kpa))
-    if not LOWEST * most_kg <= estimate_kg <= HIGHEST * most_kg:
+    if not holds_payload(estimate_kg, width_kg, most_kg):
         return Load(load.assumed_kg, assumed_kg=load.assumed_kg), estimate_kg, width_kg
     if width_kg > controller.config.load_known * most_kg:
         return load, estimate_kg, width_kg

@@ -44,7 +44,7 @@ import numpy as np
 from mjx_softarm.control import allocated_error
 from mjx_softarm.deploy.belief import Belief
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.sensing.load import HIGHEST, LOWEST
+from mjx_softarm.sensing.load import holds_payload
 
 
 class Response(Enum):
@@ -170,7 +170,7 @@ def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> Iterato
         return
     load, most_kg = belief.load, float(controller.policy.load_estimator.load_scale_kg)
     config, believed = controller.config, f"the pose is estimated with {1e3 * load.believed_kg:.0f} g"
-    if not LOWEST * most_kg <= belief.estimate_kg <= HIGHEST * most_kg:
+    if not holds_payload(belief.estimate_kg, belief.width_kg, most_kg):
         text = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g, {believed}"
         yield Event(Fault.LOAD_UNKNOWN, text)
     elif belief.width_kg > config.load_known * most_kg:

@@ -35,7 +35,7 @@ N_AVERAGED = 8  # number of estimates in the moving average
 JUMP = 0.25  # distance from the average, as a share of the largest payload, that makes an estimate an outlier
 N_JUMPS = 2  # number of consecutive outliers that restart the average
 QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
-# Payloads in the network's data, as shares of the largest one: an estimate outside is no payload.
+# Payloads in the network's data, as shares of the largest one: an interval outside holds no payload.
 LOWEST, HIGHEST = -0.5, 1.5
 # Standard deviations of the factors by which the simulated change is off; by hand, from rods: of all chambers
 # together, by masses and areas that are off by some per cent; of each chamber at each pose.
@@ -139,6 +139,12 @@ def _solved(matrix: Array, right: Array) -> Array:
         pivot = rows[..., k : k + 1, :] / rows[..., k : k + 1, k : k + 1]
         rows = rows - (rows[..., k : k + 1] - unit[:, k : k + 1]) * pivot
     return rows[..., c]
+
+
+def holds_payload(estimate_kg: float, half_width_kg: float, largest_kg: float) -> bool:
+    """Return whether the interval of an estimate holds a payload; not where the estimate is NaN."""
+    low_kg, high_kg = LOWEST * largest_kg, HIGHEST * largest_kg
+    return estimate_kg + half_width_kg >= low_kg and estimate_kg - half_width_kg <= high_kg
 
 
 def averaged(load: Load, estimate_kg: float, half_width_kg: float, largest_kg: float) -> Load:
