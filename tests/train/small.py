@@ -1,5 +1,6 @@
 """A short arm and a short run, which compile in seconds."""
 
+from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 from train.agent.registry import World, learner_of
@@ -23,6 +24,13 @@ CONFIG = TrainConfig(learner=LEARNER, env=EnvConfig(n_poses=256))
 
 def new_job(config, env, **more):
     return Job(config.learner, env, learner_of(config.learner, World(env)), **more)
+
+
+def distil_little(monkeypatch):
+    """Distil the networks of an arm from few poses, in seconds; test_estimator asks how exact they are."""
+    few = {"N_TRAINING": 512, "N_JUDGING": 256, "N_HELD_OUT": 64, "PAYLOADS": (0.0,)}
+    for name, value in {**few, "SCHEDULE": Schedule(10, 4e-3, 256)}.items():
+        monkeypatch.setattr(f"train.runs.estimator.{name}", value)
 
 
 def flags(**changes):

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
-from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
-from tests.train.small import CONFIG, SHORT, flags, new_job
+from tests.train.small import CONFIG, SHORT, distil_little, flags, new_job
 from train.__main__ import main
 from train.runs.checkpoint import Checkpoints, RunError
 from train.runs.folder import Run
@@ -105,10 +104,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     config = json.loads((whole / "config.json").read_text())
     assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
-    brief = Schedule(10, 4e-3, 256)
-    smallest = {"N_TRAINING": 512, "N_JUDGING": 256, "N_HELD_OUT": 64}
-    for name, smaller in (smallest | {"SCHEDULE": brief, "PAYLOADS": (0.0,)}).items():
-        monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)  # how exact it is, test_estimator asks
+    distil_little(monkeypatch)
     monkeypatch.setattr("train.runs.arm_model.N_WORKSPACE", 256)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()

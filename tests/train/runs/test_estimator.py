@@ -89,15 +89,6 @@ def test_payload_is_estimated_and_then_the_pose(distilled, payload_kg):
     assert off_mm(0.0) > 1.5 * off_mm(estimate_kg)
 
 
-def test_same_seed_same_networks(monkeypatch):
-    small(monkeypatch, 20)
-    for name, few in {"N_TRAINING": 512, "N_JUDGING": 256, "PAYLOADS": (0.0,)}.items():
-        monkeypatch.setattr(module, name, few)
-    one, same = (jax.tree.leaves(distil(SPEC, 3)[:3]) for _ in range(2))
-    assert all(x.dtype == np.float32 for x in one)
-    assert all(np.array_equal(x, y) for x, y in zip(one, same, strict=True))
-
-
 def test_held_out_seed_is_refused():
     with pytest.raises(ValueError, match="seed: got 20000, which draws the held-out equilibria"):
         distil(SPEC, HELD_OUT_SEED)
