@@ -132,12 +132,11 @@ def _solved(matrix: Array, right: Array) -> Array:
 
     The matrix is positive definite, so no rows need to change places. Only operations that exports have.
     """
-    c = right.shape[-1]
-    unit = np.eye(c, dtype=right.dtype)
-    rows = array_namespace(matrix, right).concat([matrix, right[..., None]], axis=-1)
+    c, xp = right.shape[-1], array_namespace(matrix, right)
+    rows = xp.concat([matrix, right[..., None]], axis=-1)
     for k in range(c):
         pivot = rows[..., k : k + 1, :] / rows[..., k : k + 1, k : k + 1]
-        rows = rows - (rows[..., k : k + 1] - unit[:, k : k + 1]) * pivot
+        rows = xp.where(np.arange(c)[:, None] == k, pivot, rows - rows[..., k : k + 1] * pivot)
     return rows[..., c]
 
 
