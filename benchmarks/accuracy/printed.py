@@ -278,14 +278,10 @@ def curves_figure(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) 
         for k, (name, change) in enumerate(SHOWN.items()):
             if runs := cases.get(f"{task}-{name}"):
                 rows = [[row for row in run if f"evaluation/{key}" in row] for run in runs]
-                steps, values = (
-                    np.array([[row[x] for row in run] for run in rows])
-                    for x in ("env_steps", f"evaluation/{key}")
-                )
-                panel.plot(steps[0], values.mean(axis=0), color=colormaps["tab10"](k), label=change)
-                panel.fill_between(
-                    steps[0], values.min(axis=0), values.max(axis=0), color=colormaps["tab10"](k), alpha=0.2
-                )
+                steps, colour = [row["env_steps"] for row in rows[0]], colormaps["tab10"](k)
+                values = np.array([[row[f"evaluation/{key}"] for row in run] for run in rows])
+                panel.plot(steps, values.mean(axis=0), color=colour, label=change)
+                panel.fill_between(steps, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.2)
         panel.set_yscale("log" if key == "median_mm" else "linear")
     panels[0][0].legend(frameon=False)
     # Losses, of the first seed.

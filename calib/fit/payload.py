@@ -28,7 +28,7 @@ from mjx_softarm.sensing.held_pressures import (
     residual,
     sections_of,
 )
-from mjx_softarm.sensing.load import QUANTILE
+from mjx_softarm.sensing.load import N_PASSES, QUANTILE
 from mjx_softarm.spec import ArmSpec
 
 N_POSES, SEED = 400, 1  # poses over the workspace, and their seed
@@ -104,7 +104,7 @@ def told_payload(
     effect, found = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
     left_kpa = pressure_kpa - at.pressure_kpa - found.mean_kpa.reshape(effect.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
-    for _ in range(2):
+    for _ in range(N_PASSES):
         weight = np.linalg.solve(_covariance(held, at, payload_kg), effect[..., None])[..., 0]
         variance = 1.0 / np.sum(weight * effect, axis=1)
         payload_kg = variance * np.sum(weight * left_kpa, axis=1)

@@ -62,8 +62,7 @@ class Belief:
         window = Window(*(np.empty((0, n)) for n in (n_springs, n_chambers, n_chambers)))
         springs, chambers = np.zeros(n_springs, bool), np.zeros(n_chambers, bool)
         masks = springs, springs, chambers, chambers
-        own_kg, unknown_m = spec.mass.payload_kg, np.full(n_springs, np.nan)
-        load = Load(own_kg, assumed_kg=own_kg)
+        unknown_m, load = np.full(n_springs, np.nan), Load.assumed(spec.mass.payload_kg)
         return cls(controller, Command.none(spec), window, unknown_m, *masks, load)
 
     @property
@@ -152,7 +151,7 @@ def _weighed(
     most_kg = float(model.load_scale_kg)
     estimate_kg, width_kg = map(float, estimate_load(model, mean_m, mean_kpa))
     if not holds_payload(estimate_kg, width_kg, most_kg):
-        return Load(load.assumed_kg, assumed_kg=load.assumed_kg), estimate_kg, width_kg
+        return Load.assumed(load.assumed_kg), estimate_kg, width_kg
     if width_kg > controller.config.load_known * most_kg:
         return load, estimate_kg, width_kg
     return averaged(load, estimate_kg, width_kg, most_kg), estimate_kg, width_kg

@@ -44,9 +44,9 @@ N_PASSES = 2  # number of estimates; each takes D of the last
 
 
 class LoadEstimator(NamedTuple):
-    """What springs at rest tell of the pressures that hold them, with c chambers a section. All float32.
+    """Network from springs at rest to the pressures that hold them, with c chambers a section. All float32.
 
-    The outputs are the pressures without a payload [kPa] and their change by a payload [kPa / kg], both of
+    Its outputs are the pressures without a payload [kPa] and their change by a payload [kPa / kg], both of
     all chambers, and the logarithm of each section's v.
     """
 
@@ -79,6 +79,11 @@ class Load(NamedTuple):
     began: bool = False  # whether the last estimate restarted the average
     half_width_kg: float = 0.0  # half-width of the 95 % interval, the mean of the estimates' own
     assumed_kg: float = 0.0  # payload without any estimate, the specification's
+
+    @classmethod
+    def assumed(cls, kg: float) -> Load:
+        """Return the payload of an arm before any estimate, the specification's [kg]."""
+        return cls(kg, assumed_kg=kg)
 
     @property
     def believed_kg(self) -> float:

@@ -124,15 +124,14 @@ def fit_load_estimator(
     spring_m, light_kpa, effect = (values[both] for values in at)
     # What the calibration knows of the real arm's pressures
     if held is None:
-        load_kg, kpa = (np.asarray(values)[both] for values in loaded[:2])
+        load_kg, kpa = (np.asarray(values)[both] for values in (loaded.load_kg, loaded.pressure_kpa))
         off_kpa = kpa - light_kpa - (load_kg - own_kg)[:, None] * effect
-        covariance, share = (
-            _square(off_kpa.reshape(len(kpa), n_sections, -1)),
-            np.ones((len(kpa), n_sections)),
-        )
+        covariance = _square(off_kpa.reshape(len(kpa), n_sections, -1))
+        left_kpa, share = np.zeros_like(light_kpa), np.ones((len(kpa), n_sections))
     else:
-        covariance, share = held.covariance_kpa2, residual(held, spring_m, light_kpa).share
-    held_at_kpa = _held(spec, held, spring_m, light_kpa, np.zeros_like(effect))
+        mean_kpa, share = residual(held, spring_m, light_kpa)
+        covariance, left_kpa = held.covariance_kpa2, mean_kpa.reshape(light_kpa.shape)
+    held_at_kpa = light_kpa + left_kpa + spec.unmodelled_kpa(spring_m)
     # Learn, and judge by poses that are not learned
     out = np.float32(np.concatenate([held_at_kpa, effect, np.log(share)], axis=1))
     parts = np.split(spring_m, [-N_JUDGING]), np.split(out, [-N_JUDGING])
