@@ -165,7 +165,7 @@ def _plan(
     recorded = load_recorded(calibration / RECORDED_FILE, arm.spec.n_chambers)
     # Choose the poses, and tell what they are for.
     xla.enable_compilation_cache()
-    found = plan(arm.spec, recorded, poses, seed, arm.held)
+    found = plan(arm, recorded, poses, seed)
     write_plan(out, found.pressure_kpa)
     now, then = found.n_unknown
     n_others = poses - found.n_informative - found.n_payload

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib.arm import CalibratedArm
 from calib.fit.equilibrium import N_KINDS, error_groups, simulate, unmeasured
 from calib.fit.leastsquares import QUANTILE
 from calib.fit.parameters import priors, tolerances
@@ -34,7 +35,6 @@ from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write
 from mjx_softarm.control import allocation
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import pressure_levels, settle_many
-from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.spec import ArmSpec
 
 KIND, RECORDED_FILE = "recorded", "recorded.npz"  # file in the folder of a calibration
@@ -96,18 +96,18 @@ def load_recorded(path: Path, n_chambers: int) -> Recorded:
     return found
 
 
-def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressures | None = None) -> Plan:
+def plan(arm: CalibratedArm, recorded: Recorded, n: int, seed: int) -> Plan:
     """Choose poses to record.
 
     Args:
-        spec: calibrated arm.
+        arm: calibrated arm.
         recorded: poses of its calibration.
         n: number of poses to choose.
         seed: seed of the candidates and of the draw.
-        held: residual pressures of its calibration, if there are some.
     """
     # Draw candidates, and choose informative poses among them.
-    rng, tolerance = np.random.default_rng(seed), tolerances(spec)
+    (spec, _, held), rng = arm, np.random.default_rng(seed)
+    tolerance = tolerances(spec)
     candidates, spring_m = _candidates(spec, min(20 * n, MAX_CANDIDATES), rng)
     covariance = _covariance(spec, recorded)
     before = n_unknown(covariance)
@@ -118,7 +118,7 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressur
     telling, widths_kg = np.array([], int), None
     if held is not None:
         states = spring_m, candidates
-        at, known = payload_poses(spec), informed(held, *(x[informative] for x in states))
+        at, known = payload_poses(arm), informed(held, *(x[informative] for x in states))
         if np.median(payload_half_widths(known, at, 0.0)) > KNOWN_SHARE * spec.mass.largest_payload_kg:
             n_left = n - round(SHARE_FAR * n) - len(informative)
             telling = choose_for_payload(known, at, *states, n_left, informative)

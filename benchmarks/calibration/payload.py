@@ -1,11 +1,11 @@
 """Payloads of rods, arms of other physics, told from springs and pressures after a calibration.
 
-A rod is recorded at random poses and calibrated without S2R, which payloads do not need. Then it is held at
-springs around the circle, with payloads that nobody tells. The springs are those that the shipped policy asks
-the specified arm for. With a kilogram some are out of reach, and the rod stays where its pressures end. The
-payload is told by generalised least squares with the calibration's own covariances, as the deployed network
-learns to tell it. The residual pressures are a line in the spring lengths, as before, or the process of each
-section.
+A rod is recorded at random poses and calibrated. Then it is held at springs around the circle, with payloads
+that nobody tells. The springs are those that the shipped policy asks the specified arm for. With a kilogram
+some are out of reach, and the rod stays where its pressures end. The payload is told by generalised least
+squares with the calibration's own covariances, as the deployed network learns to tell it. The residual
+pressures are a line in the spring lengths, or the process of each section; the effect of a payload is the
+simulated one, or is corrected by S2R.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ import numpy as np
 
 from benchmarks.calibration.planning import log_at_rest
 from benchmarks.harness.common import target
-from calib import steps
-from calib.fit.held_pressures import fit_held_pressures
+from calib.arm import CalibratedArm
 from calib.fit.leastsquares import ridge
 from calib.fit.payload import told_payload
 from calib.fit.s2r import simulate_poses
@@ -32,7 +31,7 @@ from mjx_softarm.mechanics.excitation import circle_poses, random_pressures
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.policy.runtime import PolicyRunner, tip_pose
 from mjx_softarm.sensing.load import QUANTILE
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import ARM_FILE, ArmSpec
 from mjx_softarm.twin.instruments import S2R_SESSION
 from mjx_softarm.twin.rod_twin import RodTwin
 
@@ -89,20 +88,21 @@ def circle_springs(n: int) -> np.ndarray:
 def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list[dict[str, Any]]:
     # Record and calibrate the rod.
     spec = ArmSpec.default()
-    arm = RodTwin(seed, spec, session=S2R_SESSION)
-    log, file = home / f"rod{seed}-{n_poses}.npz", home / f"rod{seed}-{n_poses}.toml"
+    arm, folder = RodTwin(seed, spec, session=S2R_SESSION), home / f"rod{seed}-{n_poses}"
+    log = folder / "log.npz"
     if not log.exists():
         write_log(log, log_at_rest(arm, random_pressures(spec, n_poses, seed)))
     logs = [read_log(log, spec)[0]]
-    if not file.exists():
-        only = {"springs": steps.springs, "chambers": steps.chambers}
-        calibrate(logs, spec, steps=only).spec.to_toml(file)
-    spec = ArmSpec.from_toml(file)
+    if not (folder / ARM_FILE).exists():
+        found = calibrate(logs, spec).arm
+        found.write_models(folder)
+        found.spec.to_toml(folder / ARM_FILE)
+    calibrated = CalibratedArm.read(folder)
+    spec = calibrated.spec
     poses = measurements_of(logs, spec).poses.with_lengths(spec)
     found = simulate_poses(spec, poses.spring_m)
     columns = found.spring_m, poses.pressure_kpa, found.pressure_kpa
-    spring_m, measured, simulated = (np.asarray(values[found.valid], float) for values in columns)
-    rows, held = (spring_m, measured, simulated), fit_held_pressures(spec, spring_m, measured, simulated).held
+    rows = tuple(np.asarray(values[found.valid], float) for values in columns)
     # Hold it around the circle with payloads, and tell them.
     figures = []
     for payload_g in PAYLOADS_G:
@@ -112,7 +112,8 @@ def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list
         )
         ways = {
             "line": told_by_line(spec, rows, read_m, kpa),
-            "process": told_payload(spec, held, read_m, kpa),
+            "process": told_payload(calibrated._replace(s2r=None), read_m, kpa),
+            "process and S2R": told_payload(calibrated, read_m, kpa),
         }
         for way, (told_kg, half_width_kg) in ways.items():
             off_g = 1e3 * told_kg - payload_g

@@ -99,14 +99,20 @@ def without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec:
 
     The law holds no pressure that neither stretches nor bends a section, and poses of a log may.
     """
-    matrices, chambers = allocation(spec), spec.chambers
+    matrices = allocation(spec)
     if matrices is None:
         return pressure_kpa
-    # Effective areas at the lengths of the chambers, which lie in the plane through their section's springs
-    stretched_m = spring_m @ chambers_of_springs(spec).T - spec.at_chambers(spec.geometry.section_length_m)
-    area = spec.per_chamber(chambers.area_m2) + stretched_m * spec.per_chamber(chambers.area_slope_m)
-
     # The same forces and moments by pressures in the planes
-    plane = np.eye(spec.n_chambers) - matrices.redundant
+    plane, area = np.eye(spec.n_chambers) - matrices.redundant, effective_area_m2(spec, spring_m)
     push = plane @ (area * pressure_kpa)[..., None]
     return (np.linalg.pinv(plane @ (area[..., None] * plane)) @ push)[..., 0]
+
+
+def effective_area_m2(spec: ArmSpec, spring_m: np.ndarray) -> np.ndarray:
+    """Return the effective areas (m, n_chambers) [m^2] of chambers at spring lengths (m, n_springs) [m].
+
+    The chambers' lengths lie in the plane through their section's springs.
+    """
+    stretched_m = spring_m @ chambers_of_springs(spec).T - spec.at_chambers(spec.geometry.section_length_m)
+    chambers = spec.chambers
+    return spec.per_chamber(chambers.area_m2) + stretched_m * spec.per_chamber(chambers.area_slope_m)

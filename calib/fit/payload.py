@@ -8,17 +8,38 @@ variance of the payload is the inverse of the information
 
 Poses that are recorded make v_s smaller around them, whatever pressures are measured there. So poses can be
 chosen before they are recorded.
+
+The log of an unloaded arm does not show e, but it shows how the tip rises with the springs. By the principle
+of virtual work, chambers of effective areas A that lift a payload at the height z do the work
+
+    m g dz = sum_t A_t dp_t dc_t    for all changes dc of the chambers' lengths.
+
+So where the sim-to-real network raises the simulated tip by h, e grows by g (dh / dc) / A. A real arm's tip
+lies up to some centimetres aside of the simulated one, which is a lever of a payload.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.fit.s2r import simulate_poses
+from calib.arm import CalibratedArm
+from calib.fit.held_pressures import effective_area_m2, without_redundant_part
+from calib.fit.s2r import BATCH, simulate_poses, without_limits
+from mjx_softarm._support import xla
+from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.settle import arms_at_once, settle
+from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.held_pressures import (
     HeldPressures,
@@ -29,7 +50,7 @@ from mjx_softarm.sensing.held_pressures import (
     sections_of,
 )
 from mjx_softarm.sensing.load import N_PASSES, QUANTILE
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.sensing.s2r import S2R, corrected
 
 N_POSES, SEED = 400, 1  # poses over the workspace, and their seed
 
@@ -42,20 +63,59 @@ class PayloadPoses(NamedTuple):
     effect_kpa_per_kg: np.ndarray  # (m, n_chambers) change of these pressures by a payload
 
 
-def payload_poses(spec: ArmSpec, n: int = N_POSES, seed: int = SEED) -> PayloadPoses:
+def payload_poses(arm: CalibratedArm, n: int = N_POSES, seed: int = SEED) -> PayloadPoses:
     """Return poses at n random pressures, without those at which the arm does not settle."""
-    found = settle_many(spec, random_pressures(spec, n, seed))
-    at, both = held_at(spec, np.asarray(found.spring_m)[found.settled])
+    found = settle_many(arm.spec, random_pressures(arm.spec, n, seed))
+    at, both = held_at(arm, np.asarray(found.spring_m)[found.settled])
     return PayloadPoses(*(values[both] for values in at))
 
 
-def held_at(spec: ArmSpec, spring_m: np.ndarray) -> tuple[PayloadPoses, np.ndarray]:
+def held_at(arm: CalibratedArm, spring_m: np.ndarray) -> tuple[PayloadPoses, np.ndarray]:
     """Return springs (m, n_springs) [m] with what holds them, and a mask (m,) of those that are held."""
-    own_kg, payload_kg = spec.mass.payload_kg, spec.mass.largest_payload_kg
-    arms = (spec.replace(mass={"payload_kg": own_kg + kg}) for kg in (0.0, payload_kg))
+    spec, payload_kg = arm.spec, arm.spec.mass.largest_payload_kg
+    arms = (spec.replace(mass={"payload_kg": spec.mass.payload_kg + kg}) for kg in (0.0, payload_kg))
     light, heavy = (simulate_poses(arm, spring_m) for arm in arms)
-    effect = (heavy.pressure_kpa - light.pressure_kpa) / payload_kg
+    effect = (heavy.pressure_kpa - light.pressure_kpa) / payload_kg + effect_of_s2r(arm, spring_m)
     return PayloadPoses(spring_m, light.pressure_kpa, effect), light.valid & heavy.valid
+
+
+def effect_of_s2r(arm: CalibratedArm, spring_m: np.ndarray) -> np.ndarray:
+    """Return by how much S2R changes the effect (m, n_chambers) [kPa / kg] of a payload; 0 without S2R.
+
+    Args:
+        arm: calibrated arm.
+        spring_m (m, n_springs) [m]: spring lengths.
+    """
+    spec, s2r = arm.spec, arm.s2r
+    if s2r is None:
+        return np.zeros((len(spring_m), spec.n_chambers))
+    # With half of the largest payload the derivative is the mean one up to the largest.
+    half_kg = spec.mass.payload_kg + spec.mass.largest_payload_kg / 2
+    params = without_limits(spec.replace(mass={"payload_kg": half_kg}))
+    rise = _rises(arms_at_once(spec.n_links))
+    rises = xla.in_batches(lambda rows: rise(rows, params, s2r), BATCH, spring_m)
+    force_n = GRAVITY_M_S2 * rises @ np.linalg.pinv(chambers_of_springs(spec))
+    return without_redundant_part(1e-3 * force_n / effective_area_m2(spec, spring_m), spring_m, spec)
+
+
+@functools.cache
+def _rises(n_at_once: int | None) -> Callable[..., Array]:
+    """Return a program for the derivative (..., n_springs) of the payload's rise by S2R, by the springs."""
+
+    def rise_m(reference_m: Array, params: ArmParams, s2r: S2R) -> Array:
+        end = settle(chain_kinematics(params), params, reference_m, n_at_once)
+        frame = end.tip_position_m, end.tip_rotation
+        simulated_m, real_m = (_height_m(at, params) for at in (frame, corrected(s2r, frame, end.spring_m)))
+        return real_m - simulated_m
+
+    return xla.jit(jax.vmap(jax.grad(rise_m), in_axes=(0, None, None)), uses_mjx=False)
+
+
+def _height_m(frame: tuple[Array, Array], params: ArmParams) -> Array:
+    """Return the height () [m] of the payload below a tip; the length of its axes does not matter."""
+    position_m, rotation = frame
+    axis = rotation[:, 2] / jnp.linalg.norm(rotation[:, 2])
+    return position_m[2] - params.tool_offset_m[-1] * axis[2]
 
 
 def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float) -> np.ndarray:
@@ -88,19 +148,20 @@ def informed(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray
 
 
 def told_payload(
-    spec: ArmSpec, held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray
+    arm: CalibratedArm, spring_m: np.ndarray, pressure_kpa: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return payloads (m,) [kg] of arms at rest, and half-widths (m,) of their 95 % intervals.
 
     The covariance depends a little on the payload itself, so the estimate is repeated once.
 
     Args:
-        spec: calibrated arm.
-        held: residual pressures of its calibration.
+        arm: calibrated arm, with residual pressures.
         spring_m (m, n_springs) [m]: spring lengths.
         pressure_kpa (m, n_chambers) [kPa]: measured pressures.
     """
-    at, _ = held_at(spec, spring_m)
+    (at, _), held = held_at(arm, spring_m), arm.held
+    if held is None:
+        raise ValueError("arm.held: got None, expected residual pressures")
     effect, found = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
     left_kpa = pressure_kpa - at.pressure_kpa - found.mean_kpa.reshape(effect.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))

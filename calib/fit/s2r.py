@@ -85,11 +85,14 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
         spec: calibrated arm.
         reference_m (n, n_springs) [m]: spring lengths of the real arm, finite, n at least 1.
     """
-    # Lift the pressure limits, and settle in batches of one size.
-    limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
-    params = ArmParams.from_spec(spec)._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
-    settled = functools.partial(_solver(arms_at_once(spec.n_links)), params)
+    settled = functools.partial(_solver(arms_at_once(spec.n_links)), without_limits(spec))
     return xla.in_batches(settled, BATCH, reference_m)
+
+
+def without_limits(spec: ArmSpec) -> ArmParams:
+    """Return the numbers of an arm whose pressures have no limits that a real one reaches."""
+    limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
+    return ArmParams.from_spec(spec)._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
 
 
 @functools.cache

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from calib.__main__ import main
+from calib.arm import CalibratedArm
 from calib.fit.held_pressures import fit_held_pressures
 from calib.plan import (
     RECORDED_FILE,
@@ -78,7 +79,7 @@ def recorded():
 
 def test_a_plan_makes_directions_known(recorded):
     """Poses of small pressures do not tell how areas change with length."""
-    found = plan(SMALL, recorded, 30, seed=0)
+    found = plan(CalibratedArm(SMALL), recorded, 30, seed=0)
     assert found.pressure_kpa.shape == (30, 3)
     assert found.n_unknown[1] < found.n_unknown[0]
     assert 1 <= found.n_informative <= 15
@@ -91,14 +92,14 @@ def test_markers_of_the_calibration_count_for_the_plan_too(recorded, tmp_path):
     save_recorded(tmp_path / RECORDED_FILE, with_markers)
     loaded = load_recorded(tmp_path / RECORDED_FILE, 3)
     np.testing.assert_array_equal(loaded.scale, with_markers.scale)
-    unknown = [plan(SMALL, known, 30, seed=0).n_unknown for known in (recorded, loaded)]
+    unknown = [plan(CalibratedArm(SMALL), known, 30, seed=0).n_unknown for known in (recorded, loaded)]
     assert unknown[1][0] < unknown[0][0] and unknown[1][1] < unknown[0][1]
 
 
 def test_straight_poses_are_worth_more_where_the_model_fits_them_better(recorded):
     """The recorded pressures are so small that the arm hardly bends."""
     better = recorded._replace(scale=recorded.scale * [[1.0], [0.1]])
-    unknown = [plan(SMALL, known, 30, 0).n_unknown[0] for known in (recorded, better)]
+    unknown = [plan(CalibratedArm(SMALL), known, 30, 0).n_unknown[0] for known in (recorded, better)]
     assert unknown[1] < unknown[0]
 
 
@@ -133,7 +134,7 @@ def test_poses_are_planned_for_the_payload_where_it_is_not_known():
     left_kpa = np.random.default_rng(1).normal(0.0, [[[1.0]], [[1e-3]]], (2, 60, 3))
     for left, n_payload in zip(left_kpa, (10, 0), strict=True):
         held = fit_held_pressures(SMALL, spring_m, pressure_kpa + left, pressure_kpa).held
-        found = plan(SMALL, recorded, 20, 0, held)
+        found = plan(CalibratedArm(SMALL, held=held), recorded, 20, 0)
         assert found.n_informative == 0 and found.n_payload == n_payload
         now_kg, then_kg = found.half_width_kg
         assert then_kg < now_kg if n_payload else then_kg == now_kg

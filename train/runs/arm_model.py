@@ -15,10 +15,10 @@ import numpy as np
 
 import mjx_softarm
 from calib.arm import CalibratedArm
+from calib.fit import payload
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
 from mjx_softarm.policy.networks import ArmModel, take_networks
-from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 from train.runs import estimator
@@ -51,14 +51,14 @@ def arm_model(
     Raises:
         SpecError: the arm settles at too few pressures.
     """
-    file, key = folder and folder / ESTIMATORS_FILE, _key(arm.spec, arm.held)
+    file, key = folder and folder / ESTIMATORS_FILE, _key(arm)
     # Take the networks of the folder or of this process, else distil them
     if file and (kept := _read(file, key, arm.spec)):
         networks, errors = kept
     else:
         if key not in _distilled:
             tell("distilling pose and payload estimators for this arm, about a minute ...")
-            _distilled[key] = distil(arm.spec, SEED, arm.held)
+            _distilled[key] = distil(arm, SEED)
         distilled = _distilled[key]
         networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
         errors = {
@@ -85,21 +85,22 @@ def _read(file: Path, key: str, spec: ArmSpec) -> tuple[tuple[Any, Any, Any], di
         return None
 
 
-def _key(spec: ArmSpec, held: HeldPressures | None) -> str:
-    """Return a checksum of the arm with its residual pressures, of the networks' settings, JAX and the code.
+def _key(arm: CalibratedArm) -> str:
+    """Return a checksum of the arm with its models, of the networks' settings, JAX and the code.
 
-    The code is `estimator.py` and `first_networks.py` beside this file, `mjx_softarm/spec.py` and the modules
-    of `_support`, `mechanics` and `sensing`, without subfolders. Versions of other packages, and the device,
-    are not part of it.
+    The code is `estimator.py` and `first_networks.py` beside this file, `calib/fit/payload.py`,
+    `mjx_softarm/spec.py` and the modules of `_support`, `mechanics` and `sensing`, without subfolders.
+    Versions of other packages, and the device, are not part of it.
     """
-    settings = [spec.to_dict(), SEED, estimator.N_TRAINING, estimator.N_HELD_OUT, estimator.SCHEDULE]
+    settings = [arm.spec.to_dict(), SEED, estimator.N_TRAINING, estimator.N_HELD_OUT, estimator.SCHEDULE]
     digest = hashlib.sha256(json.dumps([*settings, estimator.PAYLOADS, jax.__version__]).encode())
-    for values in held or ():
-        digest.update(values.tobytes())
+    for values in jax.tree.leaves((arm.s2r, arm.held)):
+        digest.update(np.asarray(values).tobytes())
     package = Path(mjx_softarm.__file__).parent
     folders = (package / name for name in ("_support", "mechanics", "sensing"))
     for source in (
         package / "spec.py",
+        Path(payload.__file__),
         *(Path(__file__).with_name(name) for name in ("estimator.py", "first_networks.py")),
         *(f for d in folders for f in d.glob("*.py")),
     ):

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from calib.fit.payload import held_at
+from calib.arm import CalibratedArm
+from calib.fit.payload import effect_of_s2r, held_at
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.training import Schedule, train_network
 from mjx_softarm._support.xp import array_namespace
@@ -36,7 +37,7 @@ from mjx_softarm.sensing.estimator import (
     estimate_frame,
     expected_springs,
 )
-from mjx_softarm.sensing.held_pressures import HeldPressures, held_kpa, residual
+from mjx_softarm.sensing.held_pressures import held_kpa, residual
 from mjx_softarm.sensing.load import (
     HIGHEST,
     LOWEST,
@@ -75,13 +76,12 @@ class Distilled(NamedTuple):
     errors: dict[str, dict[float, Error]]  # by quantity and payload [kg], see `_errors`
 
 
-def distil(spec: ArmSpec, seed: int, held: HeldPressures | None = None) -> Distilled:
+def distil(arm: CalibratedArm, seed: int) -> Distilled:
     """Return the networks of an arm; the same seed gives the same networks.
 
     Args:
-        spec: the arm, calibrated or not.
+        arm: the arm, calibrated or not.
         seed: seed of the equilibria, the initial weights and the batches.
-        held: residual pressures of its log, if there is one.
 
     Raises:
         ValueError: the seed draws the held-out equilibria.
@@ -89,38 +89,42 @@ def distil(spec: ArmSpec, seed: int, held: HeldPressures | None = None) -> Disti
     """
     if seed == HELD_OUT_SEED:
         raise ValueError(f"seed: got {seed}, which draws the held-out equilibria, expected another")
-    keys = _keys(seed)
+    spec, keys = arm.spec, _keys(seed)
     # Learn the pose of the arm as specified, then how a load changes it.
     pool = sample_workspace(_stronger(spec), N_TRAINING, seed)
     load_kg = jnp.full(len(pool.pose), spec.mass.payload_kg)
     poses = LoadedPool(load_kg, pool.pressure_kpa, pool.spring_m, pool.pose)
-    loaded = loaded_poses(spec, held, N_TRAINING, seed)
+    loaded = loaded_poses(arm, N_TRAINING, seed)
     estimator = _fit(first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
     estimator = _fit(estimator, _pose_loss, loaded, keys[2], "load_layers")
     # Learn what holds the arm, with a payload and without, and the springs of the unloaded arm.
-    load_estimator = fit_load_estimator(spec, held, loaded, seed)
-    unloaded = _as_measured(spec, held, sample_workspace(spec, N_TRAINING, seed))
+    load_estimator = fit_load_estimator(arm, loaded, seed)
+    unloaded = _as_measured(arm, sample_workspace(spec, N_TRAINING, seed))
     springs = _fit(first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
     # Test them.
     learned = Distilled(estimator, load_estimator, springs, {})
     learned = jax.tree.map(lambda x: np.asarray(x, np.float32), learned)
-    return learned._replace(errors=_errors(learned, spec, held))
+    return learned._replace(errors=_errors(learned, arm))
 
 
-def loaded_poses(spec: ArmSpec, held: HeldPressures | None, n: int, seed: int) -> LoadedPool:
+def loaded_poses(arm: CalibratedArm, n: int, seed: int) -> LoadedPool:
     """Draw n poses with payloads, of arms whose chambers are off if there was no log; see `distil`."""
     share = np.random.default_rng([seed, 1]).uniform(LOWEST, HIGHEST, CANDIDATES_PER_POSE * n)
-    many_kg = (spec.mass.payload_kg + spec.mass.largest_payload_kg) * share
-    return sample_loaded(spec, many_kg, CHAMBERS_OFF if held is None else 0.0, seed)
+    many_kg = (arm.spec.mass.payload_kg + arm.spec.mass.largest_payload_kg) * share
+    return sample_loaded(arm.spec, many_kg, _chambers_off(arm), seed)
 
 
-def fit_load_estimator(
-    spec: ArmSpec, held: HeldPressures | None, loaded: LoadedPool, seed: int
-) -> LoadEstimator:
+def _chambers_off(arm: CalibratedArm) -> float:
+    """Return the share by which chambers may be off: a log of the arm tells its own."""
+    return CHAMBERS_OFF if arm.held is None else 0.0
+
+
+def fit_load_estimator(arm: CalibratedArm, loaded: LoadedPool, seed: int) -> LoadEstimator:
     """Return the payload network of an arm, learned at the springs of `loaded_poses`; see `distil`."""
+    spec, _, held = arm
     own_kg, n_sections = spec.mass.payload_kg, spec.structure.n_sections
     # Pressures that hold the springs without a payload, and their change by one
-    at, both = held_at(spec, np.asarray(loaded.spring_m))
+    at, both = held_at(arm, np.asarray(loaded.spring_m))
     spring_m, light_kpa, effect = (values[both] for values in at)
     # What the calibration knows of the real arm's pressures
     if held is None:
@@ -166,39 +170,39 @@ def _keys(seed: int) -> Array:
     return jax.random.split(jax.random.key(seed), 7)
 
 
-def _loaded(spec: ArmSpec, held: HeldPressures | None, many_kg: np.ndarray, seed: int) -> LoadedPool:
+def _loaded(arm: CalibratedArm, many_kg: np.ndarray, seed: int) -> LoadedPool:
     """Draw poses of arms with payloads [kg], which are off as far as the calibration does not tell."""
-    pool = sample_loaded(spec, many_kg, CHAMBERS_OFF if held is None else 0.0, seed)
-    if held is None:
-        return _as_measured(spec, None, pool)
+    pool = sample_loaded(arm.spec, many_kg, _chambers_off(arm), seed)
+    if arm.held is None:
+        return _as_measured(arm, pool)
     # The effect of the payload is the difference to the arm without it, held at the same springs.
-    light = simulate_poses(spec, np.asarray(pool.spring_m))
+    light = simulate_poses(arm.spec, np.asarray(pool.spring_m))
     pool = jax.tree.map(lambda values: np.asarray(values)[light.valid], pool)
-    light_kpa = light.pressure_kpa[light.valid]
-    rng, effect_kpa = np.random.default_rng([seed, 2]), pool.pressure_kpa - light_kpa
-    kpa = _held(spec, held, pool.spring_m, light_kpa, effect_kpa, rng)
+    light_kpa, own_kg = light.pressure_kpa[light.valid], arm.spec.mass.payload_kg
+    effect_kpa = pool.pressure_kpa - light_kpa
+    effect_kpa += (pool.load_kg - own_kg)[:, None] * effect_of_s2r(arm, pool.spring_m)
+    kpa = _held(arm, pool.spring_m, light_kpa, effect_kpa, np.random.default_rng([seed, 2]))
     return pool._replace(pressure_kpa=jnp.asarray(kpa, jnp.float32))
 
 
-def _as_measured(spec: ArmSpec, held: HeldPressures | None, pool: Any) -> Any:
+def _as_measured(arm: CalibratedArm, pool: Any) -> Any:
     """Return poses with the pressures that hold the real arm without a payload, as far as they are known."""
     spring_m, kpa = np.asarray(pool.spring_m), np.asarray(pool.pressure_kpa)
-    return pool._replace(
-        pressure_kpa=jnp.asarray(_held(spec, held, spring_m, kpa, np.zeros_like(kpa)), jnp.float32)
-    )
+    return pool._replace(pressure_kpa=jnp.asarray(_held(arm, spring_m, kpa, np.zeros_like(kpa)), jnp.float32))
 
 
 def _held(
-    spec: ArmSpec,
-    held: HeldPressures | None,
+    arm: CalibratedArm,
     spring_m: np.ndarray,
     light_kpa: np.ndarray,
     effect_kpa: np.ndarray,
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
     """Return the pressures that hold the real arm; see `held_kpa`."""
-    kpa = light_kpa + effect_kpa if held is None else held_kpa(held, spring_m, light_kpa, effect_kpa, rng)
-    return kpa + spec.unmodelled_kpa(spring_m)
+    kpa = light_kpa + effect_kpa
+    if arm.held is not None:
+        kpa = held_kpa(arm.held, spring_m, light_kpa, effect_kpa, rng)
+    return kpa + arm.spec.unmodelled_kpa(spring_m)
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:
@@ -250,13 +254,13 @@ def _fit(
     return network._replace(**{layers: weights})
 
 
-def _errors(learned: Distilled, spec: ArmSpec, held: HeldPressures | None) -> dict[str, dict[float, Error]]:
+def _errors(learned: Distilled, arm: CalibratedArm) -> dict[str, dict[float, Error]]:
     """Return errors by payload on top of the specification's.
 
     `tip_mm` and `turn_deg` are errors of the pose network with the true load. `load_kg` is the error of arms
     whose chambers are off, `spring_mm` the error of each arm's worst spring.
     """
-    found: dict[str, dict[float, Error]] = {}
+    spec, found = arm.spec, dict[str, dict[float, Error]]()
     for share in PAYLOADS:
         payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
@@ -267,13 +271,13 @@ def _errors(learned: Distilled, spec: ArmSpec, held: HeldPressures | None) -> di
             held_out = sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED)
         else:  # at constant pressures it may buckle
             held_out = sample_loaded(spec, many_kg, 0.0, HELD_OUT_SEED)
-        pool = jax.tree.map(np.asarray, _as_measured(spec, held, held_out))
+        pool = jax.tree.map(np.asarray, _as_measured(arm, held_out))
         position_m, rotation = frame_from_pose(pool.pose)
         guess = estimate_frame(learned.estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
         springs = np.abs(expected_springs(learned.spring_model, pool.pressure_kpa) - pool.spring_m)
         # Estimate the load of arms whose chambers are off.
-        off = _loaded(spec, held, many_kg, HELD_OUT_SEED)
+        off = _loaded(arm, many_kg, HELD_OUT_SEED)
         told_kg, half_width_kg = estimate_load(learned.load_estimator, off.spring_m, off.pressure_kpa)
         errors = {
             "tip_mm": 1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1),

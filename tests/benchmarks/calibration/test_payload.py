@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration.payload import PAYLOADS_G, hold, targets
+from calib.arm import CalibratedArm
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.payload import payload_poses, told_payload
 from mjx_softarm import ArmSpec
@@ -28,7 +29,7 @@ def test_a_rod_is_held_at_springs_that_its_pressures_reach():
 @pytest.fixture(scope="module")
 def arms():
     """Springs, pressures without a payload, effects of a kilogram; and a process of small residuals."""
-    at = payload_poses(SPEC, 60)
+    at = payload_poses(CalibratedArm(SPEC), 60)
     left_kpa = 0.1 * np.random.default_rng(0).standard_normal(at.pressure_kpa.shape)
     return at, fit_held_pressures(SPEC, at.spring_m, at.pressure_kpa + left_kpa, at.pressure_kpa).held
 
@@ -38,7 +39,7 @@ def test_a_payload_is_told_within_its_interval(arms):
     for payload_kg in (0.0, 1.0):
         rng = np.random.default_rng(1)
         kpa = held_kpa(held, at.spring_m, at.pressure_kpa, payload_kg * at.effect_kpa_per_kg, rng)
-        told_kg, half_width_kg = told_payload(SPEC, held, at.spring_m, kpa)
+        told_kg, half_width_kg = told_payload(CalibratedArm(SPEC, held=held), at.spring_m, kpa)
         assert np.mean(np.abs(told_kg - payload_kg) < half_width_kg) > 0.85
         assert (half_width_kg < 0.4).all() and abs(told_kg.mean() - payload_kg) < 0.05
 

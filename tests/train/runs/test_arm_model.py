@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 def test_same_seed_same_networks(monkeypatch):
     distil_little(monkeypatch)
-    one, same = (jax.tree.leaves(distil(SHORT, 3)[:3]) for _ in range(2))
+    one, same = (jax.tree.leaves(distil(CalibratedArm(SHORT), 3)[:3]) for _ in range(2))
     assert all(x.dtype == np.float32 for x in one)
     assert all(np.array_equal(x, y) for x, y in zip(one, same, strict=True))
 
@@ -26,7 +26,7 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
     errors = {"tip_mm": {0.0: Error(1.0, 2.0, 3.0)}}
     networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
     told, file = [], tmp_path / arm_model.ESTIMATORS_FILE
-    monkeypatch.setattr(arm_model, "distil", lambda spec, seed, held: Distilled(*networks, errors))
+    monkeypatch.setattr(arm_model, "distil", lambda arm, seed: Distilled(*networks, errors))
     monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
 
     def model(spec=POLICY.spec):
@@ -51,7 +51,7 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
 
 def test_a_folder_to_read_only_changes_nothing(tmp_path, monkeypatch):
     networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
-    monkeypatch.setattr(arm_model, "distil", lambda spec, seed, held: Distilled(*networks, {}))
+    monkeypatch.setattr(arm_model, "distil", lambda arm, seed: Distilled(*networks, {}))
     monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
     monkeypatch.setattr(arm_model, "_distilled", {})
     told = []

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from calib.arm import CalibratedArm
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.payload import told_payload
 from mjx_softarm import ArmSpec
@@ -37,7 +38,7 @@ def small(monkeypatch, n_updates):
 def distilled():
     with pytest.MonkeyPatch.context() as monkeypatch:
         small(monkeypatch, 3000)
-        return distil(SPEC, 0)
+        return distil(CalibratedArm(SPEC), 0)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,7 @@ def test_payload_is_estimated_and_then_the_pose(distilled, payload_kg):
 
 def test_held_out_seed_is_refused():
     with pytest.raises(ValueError, match="seed: got 20000, which draws the held-out equilibria"):
-        distil(SPEC, HELD_OUT_SEED)
+        distil(CalibratedArm(SPEC), HELD_OUT_SEED)
 
 
 def arms_at_rest(reference_m, payload_kg, dead):
@@ -142,7 +143,7 @@ def test_lost_chambers_are_found(distilled, pool, payload_kg, share):
 
 @pytest.mark.slow
 def test_all_of_the_training_is_worth_it():
-    errors = distil(SPEC, 0).errors["tip_mm"]
+    errors = distil(CalibratedArm(SPEC), 0).errors["tip_mm"]
     assert errors[0.0].median < 0.8 and errors[0.0].p95 < 1.6  # 0.5 and 1.0 without the pressure beyond
     assert errors[0.5].median < 0.7 and errors[1.0].median < 0.7
 
@@ -161,7 +162,8 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
     rows, others = (jax.tree.map(lambda x, k=k: x[k::2], pool) for k in range(2))
     measured_kpa = rows.pressure_kpa + hardening(rows.spring_m)
     held = fit_held_pressures(spec, rows.spring_m, measured_kpa, rows.pressure_kpa).held
-    found = fit_load_estimator(spec, held, loaded_poses(spec, held, module.N_TRAINING, 0), 0)
+    arm = CalibratedArm(spec, held=held)
+    found = fit_load_estimator(arm, loaded_poses(arm, module.N_TRAINING, 0), 0)
     loaded = jax.device_get(sample_workspace(SPEC.replace(mass={"payload_kg": 0.5}), N_ARMS, 79))
     for arms, payload_kg in ((others, 0.0), (loaded, 0.5)):
         kpa = arms.pressure_kpa + hardening(arms.spring_m) + spec.unmodelled_kpa(arms.spring_m)
@@ -171,6 +173,6 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
         ).swapaxes(0, 1)
         off_kg = np.abs(told_kg - payload_kg)
         assert np.median(off_kg[1]) < 0.08 and np.median(off_kg[0]) > 1.5 * np.median(off_kg[1])
-        exact_kg, _ = told_payload(spec, held, arms.spring_m, kpa - spec.unmodelled_kpa(arms.spring_m))
+        exact_kg, _ = told_payload(arm, arms.spring_m, kpa - spec.unmodelled_kpa(arms.spring_m))
         assert np.sqrt(np.mean((told_kg[1] - exact_kg) ** 2)) < 0.03  # 0.003 after all of the training
         assert np.mean(off_kg[1] < half_width_kg[1]) > 0.9 and np.median(half_width_kg[1]) < 0.3
