@@ -142,7 +142,7 @@ def _measure(
         goals: circle; grid, over the workspace; or a CSV file of poses
         points: of the circle, or of the grid at most
         seconds: pass all goals without a stop in so long [s], from the first to the last
-        payload: mass that hangs at the gripper, which the loop is not given [g]
+        payload: mass that hangs at the gripper, which the loop is not given; a simulated arm gets it [g]
     """
     # Checks, before the arm moves
     if not 0.0 <= payload < np.inf:
@@ -166,6 +166,8 @@ def _measure(
     # The run, stop by stop or in time
     out.mkdir(parents=True)
     payload_kg = controller.policy.spec.mass.payload_kg + 1e-3 * payload
+    if payload and hasattr(driver, "attach"):
+        driver.attach(payload_kg)
 
     def save(log: Log) -> None:
         save_log(out / "log.npz", replace(log, payload_kg=np.full(len(log), payload_kg)))

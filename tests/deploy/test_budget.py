@@ -138,6 +138,15 @@ def test_errors_as_at_the_calibration_are_the_models():
     assert found.largest == "S2R" and "record the poses of `calib plan`" in found.lines()[1]
 
 
+def test_errors_with_a_payload_are_no_shift_of_the_zeros():
+    """S2R is of the unloaded arm; with a payload its error is part of the rest."""
+    off_mm = np.array([0.0, 0.0, 30.0])
+    found = split(Planted(off_mm=off_mm, payload_kg=KG), payload_kg=KG)
+    assert not found.shift_mm.any() and found.parts_mm["springs"] == 0.0
+    assert found.parts_mm["rest"] > 1.0
+    assert split(Planted(off_mm=off_mm)).shift_mm.any()
+
+
 def test_an_arm_that_the_policy_does_not_know():
     found = split(Planted(off_mm=np.array([3.0, 0.0, 4.0]), policy=POLICY), policy=POLICY)
     assert found.largest == "rest" and found.parts_mm["rest"] == pytest.approx(5.0, abs=0.4)
@@ -162,8 +171,10 @@ def test_a_reading_that_was_lost_on_arrival_does_not_count(tmp_path):
     write_accuracy(tmp_path, accuracy, told)
 
 
-def test_measure_tells_the_parts_and_logs_the_payload(tmp_path, monkeypatch, capsys):
+def test_measure_tells_the_parts_hangs_the_payload_and_logs_it(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
+    hung_kg = []
+    monkeypatch.setattr(Planted, "attach", lambda _, kg: hung_kg.append(kg), raising=False)
     save_policy(tmp_path / "policy.npz", POLICY)
     monkeypatch.setattr("mjx_softarm.deploy.__main__._controller", lambda *at: CONTROLLER)
     monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: Planted(policy=POLICY))
@@ -176,5 +187,5 @@ def test_measure_tells_the_parts_and_logs_the_payload(tmp_path, monkeypatch, cap
     assert sum(found["budget"]["parts_mm"].values()) == pytest.approx(found["translation_mm"])
     assert found["budget"]["payload_g"] == 250.0 and (out / "budget.png").stat().st_size > 0
     log = read_matrix(out / "log.npz", POLICY.spec, one_of=())[0].log()
-    assert (log.payload_kg == 0.25).all()
+    assert (log.payload_kg == 0.25).all() and hung_kg == [0.25]
     assert main(["measure", "--arm", "its:Arm", "--out", str(out), "--payload", "-1"]) == 2

@@ -180,7 +180,9 @@ def _shift(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return shifts of the springs' zeros that explain the models' errors, and the errors that they explain.
 
-    Both are zero where the errors are no larger than at the calibration, or where that is not known.
+    Both are zero where the errors are no larger than at the calibration, or where that is not known. They are
+    zero with a payload beyond the specification's: the models have learned without one, so their errors are
+    not the zeros' alone.
 
     Args:
         policy: with the models.
@@ -194,7 +196,8 @@ def _shift(
     n = spring_m.shape[1]
     expected_mm = float(np.hypot(_estimator_mm(policy, payload_kg), _s2r_mm(policy)))
     away_mm = float(np.linalg.norm(left[:, :3], axis=1).mean())
-    if not _s2r_mm(policy) or away_mm < AS_CALIBRATED * expected_mm:
+    loaded = payload_kg > policy.spec.mass.payload_kg
+    if loaded or not _s2r_mm(policy) or away_mm < AS_CALIBRATED * expected_mm:
         return np.zeros(n), np.zeros_like(left)
 
     # Derivatives of the pose by finite differences, then least squares with a prior
