@@ -32,7 +32,8 @@ from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.xp import Array, array_namespace
 
 N_AVERAGED = 8  # number of estimates in the moving average
-JUMP = 0.25  # distance from the average, as a share of the largest payload, that makes an estimate an outlier
+# An outlier is off the average by more than this share of the largest payload, and their intervals are apart.
+JUMP = 0.25
 N_JUMPS = 2  # number of consecutive outliers that restart the average
 QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
 # Payloads in the network's data, as shares of the largest one: an interval outside holds no payload.
@@ -153,7 +154,9 @@ def holds_payload(estimate_kg: float, half_width_kg: float, largest_kg: float) -
 
 def averaged(load: Load, estimate_kg: float, half_width_kg: float, largest_kg: float) -> Load:
     """Return the average with one more estimate and its half-width, for an arm with this largest payload."""
-    disagrees = load.n_estimates > 0 and abs(estimate_kg - load.kg) > JUMP * largest_kg
+    off_kg = abs(estimate_kg - load.kg)
+    far = off_kg > JUMP * largest_kg and off_kg > half_width_kg + load.half_width_kg
+    disagrees = load.n_estimates > 0 and far
     if disagrees and load.n_jumps + 1 < N_JUMPS:
         return load._replace(n_jumps=load.n_jumps + 1)
     if disagrees or load.n_estimates == 0:

@@ -131,6 +131,12 @@ def test_two_rests_that_disagree_begin_a_new_average(change_kg):
     assert not averaged(again, 0.65 + change_kg, 0.2, 1.0).began
 
 
+def test_rests_whose_intervals_meet_do_not_disagree():
+    wide = averaged(Load(0.0), 1.0, 0.2, 1.0)
+    for kg, begins in ((0.65, False), (0.55, True)):
+        assert averaged(averaged(wide, kg, 0.2, 1.0), kg, 0.2, 1.0).began is begins
+
+
 def test_a_lighter_arm_s_average_begins_anew_sooner():
     load = averaged(averaged(Load(0.1, 3), 0.15, 0.0, 0.1), 0.15, 0.0, 0.1)
     assert load == Load(0.15, 1, began=True)
