@@ -156,11 +156,21 @@ def _rests_of_loop(
             row_uses["goal not held long enough"] += len(rows)
             continue
         row_uses["goal not held long enough"] += len(rows) - n
-        rows = rows[-n:]
+        rows = _last_held(rows, log.reference_m, n)
         if watched_m is not None and still(watched_m[rows], config):
             yield rows
         else:
             row_uses["tip still moving"] += n
+
+
+def _last_held(rows: np.ndarray, reference_m: np.ndarray | None, n: int) -> np.ndarray:
+    """Return the last n rows with the same references: those of a way leave a stop before its goal does."""
+    if reference_m is None:
+        return rows[-n:]
+    changed = (reference_m[rows[1:]] != reference_m[rows[:-1]]).any(axis=1)
+    n_changes = np.append(0, np.cumsum(changed))
+    ends = np.flatnonzero(n_changes[n - 1 :] == n_changes[: len(rows) - n + 1])
+    return rows[ends[-1] : ends[-1] + n] if len(ends) else rows[-n:]
 
 
 def _lag_s(spec: ArmSpec) -> np.ndarray:

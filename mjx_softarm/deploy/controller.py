@@ -97,6 +97,7 @@ class Controller:
     window: int  # ticks
     observes_payload: bool
     lead_s: float  # time by which a moving goal is given ahead of its time
+    start_s: float  # time until an arm at rest answers to a goal that begins to move
     config: LoopConfig
 
     @classmethod
@@ -109,6 +110,9 @@ class Controller:
         )
         ahead_s = float(np.mean(gains.reference_s)) + 0.5 * config.rate_s
         lead_s = config.lead_actions * policy.action_s or ahead_s
+        # The rate of the references is known after `rate_s`, and the actuators have a dead time
+        answer_s = config.rate_s + float(np.mean(policy.spec.actuators.delay_s))
+        start_s = 0.0 if policy.action_s else round(answer_s * policy.rate_hz) / policy.rate_hz
 
         return cls(
             policy=policy,
@@ -118,6 +122,7 @@ class Controller:
             window=window,
             observes_payload=policy.observation == "payload",
             lead_s=lead_s,
+            start_s=start_s,
             config=config,
         )
 

@@ -114,7 +114,8 @@ class OrderedGoals(ListedGoals):
 class Way:
     """A goal that moves past poses (p, 6), two or more, from stop to stop, as `trace` takes them.
 
-    The way is not begun if any pose is refused.
+    It leaves a stop `Controller.start_s` after the arm has arrived there: references and actuators take this
+    time to answer. The way is not begun if any pose is refused.
     """
 
     def __init__(
@@ -146,13 +147,14 @@ class Way:
             self.n_taken = stop + 1
             if k < 0:
                 return self._stop(state, note)
-            self._began_s, self._leg = now_s, self._poses[k : stop + 1]
+            self._began_s, self._leg = now_s + self._controller.start_s, self._poses[k : stop + 1]
             self.ways.append(slice(row, row))
         elif state.lead is None:
             return state
 
-        # Go on, or stop.
-        self.ways[-1] = slice(self.ways[-1].start, row)
+        # Go on, or stop; the way's rows begin as the goal leaves the stop.
+        stands = now_s < self._began_s + 0.5 * self._controller.dt_s
+        self.ways[-1] = slice(row if stands else self.ways[-1].start, row)
         if now_s - self._began_s >= self._pace_s * (len(self._leg) - 1):
             return self._stop(state, note)
         return with_moving_goal(
@@ -174,7 +176,7 @@ Goals = ListedGoals | Way
 
 
 def on_the_way(goals: np.ndarray, share: float) -> np.ndarray:
-    """Return the pose (6,) [mm, deg] after a share of the way past goals (p, 6); its end for more than 1."""
-    at = min(share, 1.0) * (len(goals) - 1)
+    """Return the pose (6,) [mm, deg] after a share of the way past goals (p, 6); its ends beyond 0 and 1."""
+    at = min(max(share, 0.0), 1.0) * (len(goals) - 1)
     k = min(int(at), len(goals) - 2)
     return goals[k] + (at - k) * pose_error(goals[k + 1], goals[k])

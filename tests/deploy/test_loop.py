@@ -118,6 +118,9 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     goal = run.log.goal[run.ways[0]]
     assert len(goal) in (500, 501)
     np.testing.assert_allclose(goal[250], on_the_way(goals, 0.5), atol=1e-6)
+    # The references leave the stop before the goal does
+    early = run.log.reference_m[run.ways[0].start - 2] - run.log.reference_m[run.arrivals[0].row]
+    assert np.abs(early).max() > 1e-3
 
 
 @pytest.mark.parametrize("slower", [1.0, 4.0])
