@@ -89,6 +89,7 @@ def _figures(seed: int, n_poses: int, springs_m: np.ndarray, home: Path) -> list
     # Record and calibrate the rod.
     spec = ArmSpec.default()
     arm, folder = RodTwin(seed, spec, session=S2R_SESSION), home / f"rod{seed}-{n_poses}"
+    folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.npz"
     if not log.exists():
         write_log(log, log_at_rest(arm, random_pressures(spec, n_poses, seed)))
