@@ -174,7 +174,7 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     extras["held"] = held.held
     spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
     largest_kg = spec.mass.largest_payload_kg
-    at = payload_poses(CalibratedArm(spec, fit.s2r if fit.is_better else None))
+    at = payload_poses(CalibratedArm(spec, extras.get("s2r")))
     widths_kg = told_widths(held.held, at, largest_kg)
     section = sections.with_pressures(section, held, widths_kg, LOOP.load_known * largest_kg)
     return StepResult(spec, section, extras)

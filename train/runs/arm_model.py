@@ -88,9 +88,9 @@ def _read(file: Path, key: str, spec: ArmSpec) -> tuple[tuple[Any, Any, Any], di
 def _key(arm: CalibratedArm) -> str:
     """Return a checksum of the arm with its models, of the networks' settings, JAX and the code.
 
-    The code is `estimator.py` and `first_networks.py` beside this file, `calib/fit/payload.py`,
-    `mjx_softarm/spec.py` and the modules of `_support`, `mechanics` and `sensing`, without subfolders.
-    Versions of other packages, and the device, are not part of it.
+    The code is `estimator.py` and `first_networks.py` beside this file, `payload.py`, `held_pressures.py` and
+    `s2r.py` of `calib/fit`, `mjx_softarm/spec.py` and the modules of `_support`, `mechanics` and `sensing`,
+    without subfolders. Versions of other packages, and the device, are not part of it.
     """
     settings = [arm.spec.to_dict(), SEED, estimator.N_TRAINING, estimator.N_HELD_OUT, estimator.SCHEDULE]
     digest = hashlib.sha256(json.dumps([*settings, estimator.PAYLOADS, jax.__version__]).encode())
@@ -100,7 +100,7 @@ def _key(arm: CalibratedArm) -> str:
     folders = (package / name for name in ("_support", "mechanics", "sensing"))
     for source in (
         package / "spec.py",
-        Path(payload.__file__),
+        *(Path(payload.__file__).with_name(name) for name in ("payload.py", "held_pressures.py", "s2r.py")),
         *(Path(__file__).with_name(name) for name in ("estimator.py", "first_networks.py")),
         *(f for d in folders for f in d.glob("*.py")),
     ):

@@ -6,7 +6,8 @@ from calib.arm import CalibratedArm
 from calib.fit.payload import held_at
 from mjx_softarm import ArmSpec
 from mjx_softarm.sensing.pose import rotation_about
-from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
+from tests.networks import s2r_of
 
 SPEC = ArmSpec.default()
 TILT_DEG = 4.0, -3.0, 0.0
@@ -15,21 +16,11 @@ TILT_DEG = 4.0, -3.0, 0.0
 def s2r_of_a_tilt(tilt_deg, n_springs):
     """Return S2R of a base with a tilt: it shifts the tip in proportion to its place, and turns it."""
     vector_rad = np.radians(tilt_deg)
-    n_in = N_POSE_INPUTS + n_springs
-    weight = np.zeros((n_in, N_POSE_OUTPUTS))
+    weight = np.zeros((N_POSE_INPUTS + n_springs, N_POSE_OUTPUTS), np.float32)
     weight[:3, :3] = 1e3 * (rotation_about(vector_rad) - np.eye(3)).T
     angle = np.linalg.norm(vector_rad)
     gibbs = np.tan(angle / 2) * vector_rad / angle
-    bound = np.full(N_POSE_OUTPUTS, 1e6)
-    return S2R(
-        layers=((np.float32(2.0 * weight), np.float32([0, 0, 0, *gibbs])),),
-        input_low=np.full(n_in, -2.0, np.float32),
-        input_high=np.full(n_in, 2.0, np.float32),
-        output_low=np.float32(-bound),
-        output_high=np.float32(bound),
-        anchors=np.zeros((1, n_in), np.float32),
-        limit=np.float32(1.0),
-    )
+    return s2r_of(((weight, np.float32([0, 0, 0, *gibbs])),), 1e6)
 
 
 def test_a_tilt_that_s2r_knows_changes_the_effect_of_a_payload():
