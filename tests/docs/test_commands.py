@@ -1,6 +1,7 @@
 """Commands that README and pages print: the programs take all of them, and most are run, shortened."""
 
 import functools
+import json
 import re
 import shlex
 import shutil
@@ -44,6 +45,12 @@ def inline(page):
     return [" ".join(found.split()) for found in re.findall(r"`(python -m [^`]+)`", text)]
 
 
+def stored():
+    """Return the commands that made the results. The results' page has their beginnings."""
+    made = [json.loads(file.read_text("utf-8")) for file in (ROOT / "docs/results").glob("*.json")]
+    return {source["command"] for one in made for source in one.get("kinds", {"": one}).values()}
+
+
 def is_ours(command):
     return re.match(r"python -m (mjx_softarm|train|calib|benchmarks)\b", command) and not command.startswith(
         ADDED
@@ -58,7 +65,7 @@ def status_of(command):
 
 
 CALLS = sorted({call for page in PAGES for call in commands(page) if is_ours(call)})
-NAMED = sorted({call for page in PAGES for call in inline(page) if is_ours(call)} - {*CALLS})
+NAMED = sorted({call for page in PAGES for call in inline(page) if is_ours(call)} | stored() - {*CALLS})
 OTHERS = sorted({call for page in PAGES for call in commands(page) if not is_ours(call)})
 PYDOC = sorted(
     {call.split()[-1] for page in PAGES for call in inline(page) if " -m pydoc " in call} - {"MODULE"}

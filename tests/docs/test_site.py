@@ -13,6 +13,7 @@ import pytest
 from train.runs.evaluate import Summary
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def test_the_site_builds_without_a_warning(tmp_path):
@@ -24,11 +25,29 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert "equilibrium" in (tmp_path / "api/index.html").read_text("utf-8")  # docstrings are read
 
 
-def test_the_readme_s_links_lead_to_files():
-    text = (ROOT / "README.md").read_text("utf-8")
-    links = re.findall(r"\]\(([^)#]+)|src=\"([^\"]+)", text)
-    targets = [target for pair in links for target in pair if target and "://" not in target]
-    assert targets and not [target for target in targets if not (ROOT / target).is_file()]
+def anchors(page):
+    """Return the anchors of a page's headings, as mkdocs and GitHub make them."""
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.+?```", "", page.read_text("utf-8"), flags=re.S), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def links(page):
+    """Return what a page links to, other sites left out."""
+    pairs = re.findall(r"\]\(([^)]+)|src=\"([^\"]+)", page.read_text("utf-8"))
+    return [target for pair in pairs for target in pair if target and "://" not in target]
+
+
+def test_there_are_links():
+    assert len(links(ROOT / "README.md")) > 10 and sum(len(links(page)) for page in PAGES) > 200
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_to_files_and_headings(page):
+    for link in links(page):
+        name, _, anchor = link.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.is_file(), link
+        assert not anchor or anchor in anchors(file), link
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "docs/results").glob("*.json")), ids=lambda file: file.stem)
@@ -36,16 +55,17 @@ def test_results_keep_no_path_of_a_machine(file):
     assert not re.findall(r'(?:^|["\s=:])(?:/|~/|[A-Z]:\\)\w[^"\s]*', file.read_text("utf-8"))
 
 
-def test_the_table_of_files_has_each_result_with_its_command_and_commit():
+def test_the_list_of_files_has_each_result_with_its_command_and_commit():
     page = (ROOT / "docs/results.md").read_text("utf-8")
-    rows = re.findall(r"^\| \[(\S+)\]\(results/\1\) \| (.*) \| (\w{7}) \|", page, re.MULTILINE)
+    rows = re.findall(r"^- \[(\S+)\]\(results/\1\), (\w{7}): `([^`]+)`$", page, re.M)
     assert sorted(name for name, *_ in rows) == sorted(f.name for f in (ROOT / "docs/results").glob("*.json"))
-    for name, command, commit in rows:
+    for name, commit, beginning in rows:
+        if not beginning.startswith("python -m "):
+            beginning = f"python -m benchmarks {beginning}"
         made = json.loads((ROOT / "docs/results" / name).read_text("utf-8"))
         for source in made.get("kinds", {"": made}).values():  # `guard.json` has one for each kind of machine
             assert source["commit"].startswith(commit), name
-            if command.startswith("`"):
-                assert re.sub(r" --out \S+", "", source["command"]) == command.strip("`"), name
+            assert f"{source['command']} ".startswith(f"{beginning} "), name
 
 
 def test_the_readme_s_figures_are_those_of_the_stored_run():
