@@ -1,7 +1,8 @@
 """Belief about an arm, made of readings and pressures: lengths, payload, pose, rest, doubtful parts.
 
     readings                   -> spring lengths, the last good ones where a reading is lost
-    springs, pressures at rest -> payload
+    way of the springs         -> hysteresis of the chambers
+    all this at rest, pressures -> payload
     springs, payload           -> pose of the tip (estimator, then sim-to-real network)
 
 Pure functions; NumPy only. Tests of windows take the symbols of `mjx_softarm.export`, too.
@@ -18,8 +19,10 @@ import numpy as np
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import Allocation, Gains, allocated_error, at_chambers, saturated
 from mjx_softarm.deploy.controller import LOOP, Command, Controller, LoopConfig
+from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
+from mjx_softarm.sensing.hysteresis import stop_after
 from mjx_softarm.sensing.load import Load, averaged, estimate_load, holds_payload
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 
@@ -47,6 +50,7 @@ class Belief:
     suspect: np.ndarray  # (n_chambers,) bool: a chamber that seems to have lost its pressure
     saturated: np.ndarray  # (n_chambers,) bool: a chamber at its limit, off its reference in the mean
     load: Load  # payload
+    stop: np.ndarray  # (n_chambers,) states of the chambers' hysteresis
     at_rest: bool = False  # nothing has moved for a window; one after the last action, at the earliest
     settled: bool = False  # at rest with each spring on its reference, or its chamber at a limit
     why_lost: str = ""  # message of the sensors
@@ -63,7 +67,7 @@ class Belief:
         springs, chambers = np.zeros(n_springs, bool), np.zeros(n_chambers, bool)
         masks = springs, springs, chambers, chambers
         unknown_m, load = np.full(n_springs, np.nan), Load.assumed(spec.mass.payload_kg)
-        return cls(controller, Command.none(spec), window, unknown_m, *masks, load)
+        return cls(controller, Command.none(spec), window, unknown_m, *masks, load, np.zeros(n_chambers))
 
     @property
     def pose(self) -> np.ndarray:
@@ -103,14 +107,15 @@ def believe(
     gains, tolerance_m = policy.gains, policy.tolerance_m
     in_force_kpa, asked_m = command.pressure_kpa, command.reference_m
 
-    # Lengths, and the window that ends with them
+    # Lengths with their hysteresis, and the window that ends with them
     spring_m, lost, why = read_lengths(policy.sensor, readings, last.spring_m)
+    stop = hysteresis_after(policy, last.stop, last.spring_m, spring_m)
     seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
     tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
     rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
     window, spring, chamber = Window(*rows), np.zeros_like(last.stuck), np.zeros_like(last.suspect)
     masks = lost, spring, chamber, chamber
-    belief = Belief(controller, command, window, spring_m, *masks, last.load, why_lost=why)
+    belief = Belief(controller, command, window, spring_m, *masks, last.load, stop, why_lost=why)
     springs_m, mean_m = window.spring_m, belief.mean_m
 
     # Rest, and trust in sensors and chambers
@@ -133,28 +138,34 @@ def believe(
     belief = replace(belief, n_unweighed=last.n_unweighed + 1)
     doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
     if belief.at_rest and belief.n_unweighed >= size and not doubtful:
-        mean_kpa = window.chamber_kpa.mean(axis=0)
-        load, estimate_kg, width_kg = _weighed(controller, last.load, mean_m, mean_kpa)
+        means = mean_m, window.chamber_kpa.mean(axis=0)
+        load, estimate_kg, width_kg = _weighed(controller, last.load, *means, stop)
         belief = replace(belief, load=load, estimate_kg=estimate_kg, width_kg=width_kg, n_unweighed=0)
     return belief
 
 
 def _weighed(
-    controller: Controller, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray
+    controller: Controller, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray, stop: np.ndarray
 ) -> tuple[Load, float, float]:
     """Return the averaged payload, this window's estimate [kg] and the half-width [kg] of its interval.
 
-    The estimate takes mean springs and pressures at rest. An estimate whose interval holds no payload leaves
-    the specified payload, and so does a first one that is not known well.
+    The estimate takes mean springs and pressures at rest, and the hysteresis there. An estimate whose
+    interval holds no payload leaves the specified payload, and so does a first one that is not known well.
     """
     model = controller.policy.load_estimator
     most_kg = float(model.load_scale_kg)
-    estimate_kg, width_kg = map(float, estimate_load(model, mean_m, mean_kpa))
+    estimate_kg, width_kg = map(float, estimate_load(model, mean_m, mean_kpa, stop))
     if not holds_payload(estimate_kg, width_kg, most_kg):
         return Load.assumed(load.assumed_kg), estimate_kg, width_kg
     if width_kg > controller.config.load_known * most_kg:
         return load, estimate_kg, width_kg
     return averaged(load, estimate_kg, width_kg, most_kg), estimate_kg, width_kg
+
+
+def hysteresis_after(policy: Policy, stop: Array, last_m: Array, spring_m: Array) -> Array:
+    """Return the hysteresis (n_chambers,) after springs moved from lengths (n_springs,) [m] to others."""
+    moved_m = at_chambers(spring_m - last_m, policy.gains.allocation)
+    return stop_after(stop, moved_m, policy.load_estimator.stroke_m)
 
 
 def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:

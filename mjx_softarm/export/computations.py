@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import LawState, pressures, saturated
-from mjx_softarm.deploy.belief import as_without, on_reference, still, stuck_springs
+from mjx_softarm.deploy.belief import as_without, hysteresis_after, on_reference, still, stuck_springs
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
@@ -34,7 +34,7 @@ def graph(controller: Controller) -> Computation:
     spec = controller.policy.spec
     springs, chambers = (spec.n_springs,), (spec.n_chambers,)
     inputs = symbol("readings", springs), symbol("goal", (6,)), symbol("last_length_m", springs)
-    inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", chambers)
+    inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", chambers), symbol("stop", chambers)
     motion = _in_motion(spec)
     found = answer(controller, *inputs, motion)
     inputs += tuple(motion) if controller.policy.observation == "motion" else ()
@@ -48,19 +48,22 @@ def answer(
     last_m: Array,
     load_kg: Array,
     pressure_kpa: Array,
+    stop: Array,
     motion: InMotion,
 ) -> dict[str, Array]:
     """Return the loop's references for readings (n_springs,) and a goal (6,), with pose, faults and payload.
 
     A lost reading holds the last length (n_springs,) [m] of its spring. References are NaN if the loop would
     not act: a spring has neither a reading nor a last length, or the goal is outside the workspace. The
-    payload () [kg] is the caller's average of estimates at rest, each from pressures (n_chambers,) [kPa].
+    payload () [kg] is the caller's average of estimates at rest, each from pressures (n_chambers,) [kPa] and
+    the state (n_chambers,) of the chambers' hysteresis, which the caller gives back in the next tick.
     Only policies that observe motion use `motion`.
     """
     # References of the policy.
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
-    told_kg, half_width_kg = estimate_load(policy.load_estimator, reading.length_m, pressure_kpa)
+    stop = hysteresis_after(policy, stop, last_m, reading.length_m)
+    told_kg, half_width_kg = estimate_load(policy.load_estimator, reading.length_m, pressure_kpa, stop)
     pose, away = tip_pose(policy, reading.length_m, load_kg)
     observed = sensed(policy, pose, reading.length_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
@@ -78,6 +81,7 @@ def answer(
         "goal_outside": ~inside,
         "load_estimate_kg": told_kg,
         "load_half_width_kg": half_width_kg,
+        "next_stop": stop,
     }
 
 
@@ -116,12 +120,14 @@ class _Inputs(NamedTuple):
     goal: Symbol  # (6,)
     pose: Symbol  # (6,)
     load_kg: Symbol  # ()
+    stop: Symbol  # (n_chambers,)
 
     @classmethod
     def of(cls, controller: Controller) -> _Inputs:
         spec, window = controller.policy.spec, controller.window
         springs, chambers = (spec.n_springs,), (spec.n_chambers,)
-        shapes = springs, springs, springs, chambers, (window, *springs), (window, *chambers), (6,), (6,), ()
+        windows = (window, *springs), (window, *chambers)
+        shapes = springs, springs, springs, chambers, *windows, (6,), (6,), (), chambers
         doubles = cls(*(symbol(name, shape) for name, shape in zip(cls._fields, shapes, strict=True)))
         return doubles._replace(pose=symbol("pose", (6,), np.float32))
 
@@ -139,7 +145,9 @@ def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]
     reading = policy.sensor.lengths(at.readings, at.spring_m)
     tip, away = tip_pose(policy, at.spring_m, at.load_kg)
     means = xp.mean(at.springs_m, axis=0), xp.mean(at.pressures_kpa, axis=0)
-    told_kg, half_width_kg = estimate_load(policy.load_estimator, *means)
+    told_kg, half_width_kg = estimate_load(policy.load_estimator, *means, at.stop)
+    last_m = symbol("last_m", at.spring_m.shape)
+    next_stop = hysteresis_after(policy, at.stop, last_m, at.spring_m)
     # Policy.
     motion = _in_motion(policy.spec)
     observed = sensed(policy, at.pose, at.spring_m, motion, at.load_kg)
@@ -153,7 +161,8 @@ def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]
     return {
         "lengths": _of(at.readings, at.spring_m, length_m=reading.length_m, lost=_lost(reading)),
         "mean_length": _of(at.springs_m, mean_m=means[0]),
-        "estimated_load": _of(at.springs_m, at.pressures_kpa, kg=told_kg, width_kg=half_width_kg),
+        "hysteresis": _of(at.stop, last_m, at.spring_m, next_stop=next_stop),
+        "estimated_load": _of(at.springs_m, at.pressures_kpa, at.stop, kg=told_kg, width_kg=half_width_kg),
         "tip": _of(at.spring_m, at.load_kg, tip=tip, away=constant(away)),
         "references": _of(*acting, asked_m=policy.actions.lengths(action)),
         "law": _of(at.reference_m, at.spring_m, *state, **law),

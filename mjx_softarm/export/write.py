@@ -39,6 +39,7 @@ def export_onnx(policy_path: Path) -> list[Path]:
     )
     unknown_m, unknown_kpa = np.full(spec.n_springs, np.nan), np.full(spec.n_chambers, np.nan)
     never = {"last_length_m": unknown_m, "load_kg": spec.mass.payload_kg, "pressure_kpa": unknown_kpa}
+    never["stop"] = np.zeros(spec.n_chambers)
     if controller.policy.observation == "motion":
         never |= computations.InMotion(unknown_m, unknown_m, np.zeros(spec.n_chambers))._asdict()
     # Write the graphs and the golden rows.
@@ -86,6 +87,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
                 "default": "the specification's: load_estimate_kg, averaged over static poses",
             },
             "pressure_kpa": {"unit": "kPa", "default": "nan: not known; of the arm at rest"},
+            "stop": {"default": "0: not known; next_stop of the last tick"},
             "before_m": lengths | {"default": f"nan: not known; {RATE_S:g} s before"},
             "last_reference_m": lengths | {"default": "nan: none yet; of the last action"},
             "integral_kpa": {"unit": "kPa", "default": "0; of the law"},
@@ -104,6 +106,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "error": {"above": policy.reward.threshold, "means": "no pressures reach the goal"},
             "load_estimate_kg": {"unit": "kg", "nan": "without pressures"},
             "load_half_width_kg": {"unit": "kg", "nan": "without pressures"},
+            "next_stop": {"range": [-1.0, 1.0]},
             "action": {"names": readings["names"], "range": [-1.0, 1.0]},
         },
         "rate_hz": policy.rate_hz,

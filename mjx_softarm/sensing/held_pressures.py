@@ -7,6 +7,9 @@ standardised. With the covariance V (c, c) between chambers,
 
     cov(r(u), r(u')) = k(u, u') V,    k = 1 + u.u' + exp(-|u - u'|^2 / (2 l^2)) + noise where u = u'.
 
+The pressures are those without the chambers' hysteresis (`mjx_softarm.sensing.hysteresis`), which depends on
+the way to a pose, not on the pose.
+
 A payload is told from pressures: about 4 kPa of the paper's arm for each kilogram. The mean of the process
 corrects them. Its variance tells how well a payload is known: it is large far from the poses of the log.
 
@@ -38,10 +41,12 @@ class HeldPressures(NamedTuple):
     state: np.ndarray  # (n, s, d) standardised springs and simulated pressures of the sections
     centre: np.ndarray  # (s, d) [m, kPa] subtracted from springs and pressures
     scale: np.ndarray  # (s, d) [m, kPa] divided by
-    residual_kpa: np.ndarray  # (n, s, c) measured minus simulated pressures
+    residual_kpa: np.ndarray  # (n, s, c) measured minus simulated pressures, without hysteresis
     length: np.ndarray  # (s,) distance of states over which the residual changes
     noise: np.ndarray  # (s,) variance that no state explains, as a multiple of V
     covariance_kpa2: np.ndarray  # (s, c, c) V
+    hysteresis_kpa: np.ndarray  # (s,) largest pressure of a chamber's hysteresis
+    stroke_m: np.ndarray  # (s,) stroke of its stop operator
 
 
 class Residual(NamedTuple):
@@ -151,6 +156,8 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
         "length": (s,),
         "noise": (s,),
         "covariance_kpa2": (s, c, c),
+        "hysteresis_kpa": (s,),
+        "stroke_m": (s,),
     }
     arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
     held = HeldPressures(**arrays)

@@ -8,9 +8,10 @@ pressures p that are measured, section by section:
 
     D = v(l) V + N + diag(f m e)^2,   I = sum e^T D^-1 e,   m = sum e^T D^-1 (p - p(l)) / I,
 
-with the calibration's covariance v(l) V (`mjx_softarm.sensing.held_pressures`), that of the network's own
-error N, and factors f by which chambers answer differently to a payload. The variance of m is
-1 / I + (f' m)^2, where f' is a factor of all chambers together.
+where p lacks the chambers' hysteresis (`mjx_softarm.sensing.hysteresis`), v(l) V is the calibration's
+covariance (`mjx_softarm.sensing.held_pressures`), N that of the network's own error, and f are factors by
+which chambers answer differently to a payload. The variance of m is 1 / I + (f' m)^2, where f' is a factor of
+all chambers together.
 
 A payload changes rarely, so estimates are averaged, until two in a row disagree with the average. Errors of
 neighbouring poses are alike, so an average counts as no more certain than its estimates.
@@ -59,6 +60,8 @@ class LoadEstimator(NamedTuple):
     out_scale: Array  # (n_out,) of the rest
     covariance_kpa2: Array  # (n_sections, c, c) V
     error_kpa2: Array  # (n_sections, c, c) N
+    hysteresis_kpa: Array  # (n_chambers,) largest pressure of each chamber's hysteresis
+    stroke_m: Array  # (n_chambers,) [m] stroke of its stop operator
     own_load_kg: Array  # () payload of the specification, on top of which m is
     load_scale_kg: Array  # () largest payload of the arm
 
@@ -106,13 +109,16 @@ def holding(estimator: LoadEstimator, spring_m: Array) -> Holding:
     return Holding(both[..., 0, :, :], both[..., 1, :, :], out[..., 2 * n_sections * c :])
 
 
-def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> tuple[Array, Array]:
+def estimate_load(
+    estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array, stop: Array | float = 0.0
+) -> tuple[Array, Array]:
     """Estimate the payload of an arm at rest.
 
     Args:
         estimator: network of the arm.
         spring_m (..., n_springs) [m]: spring lengths.
         pressure_kpa (..., n_chambers) [kPa]: pressures.
+        stop (..., n_chambers): states of the chambers' hysteresis; 0 where the way to this pose is not known.
 
     Returns:
         Payload (...) [kg], which may lie below 0 or above `load_scale_kg`, and half-width (...) [kg] of its
@@ -122,6 +128,7 @@ def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array
     found = holding(estimator, spring_m)
     effect = found.effect_kpa_per_kg
     pressure_kpa = xp.asarray(pressure_kpa, dtype=estimator.slope.dtype)
+    pressure_kpa = pressure_kpa - estimator.hysteresis_kpa * xp.asarray(stop, dtype=estimator.slope.dtype)
     left_kpa = pressure_kpa.reshape(*effect.shape) - found.pressure_kpa
     known = xp.exp(found.log_share)[..., None, None] * estimator.covariance_kpa2 + estimator.error_kpa2
     own = np.eye(effect.shape[-1], dtype=estimator.slope.dtype) * (OWN_FACTOR * effect[..., None]) ** 2
@@ -183,6 +190,8 @@ def take_load_estimator(
         out_scale=(n_out,),
         covariance_kpa2=(n_sections, c, c),
         error_kpa2=(n_sections, c, c),
+        hysteresis_kpa=(n_chambers,),
+        stroke_m=(n_chambers,),
         own_load_kg=(),
         load_scale_kg=(),
     )

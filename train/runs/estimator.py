@@ -141,7 +141,7 @@ def fit_load_estimator(arm: CalibratedArm, loaded: LoadedPool, seed: int) -> Loa
     parts = np.split(spring_m, [-N_JUDGING]), np.split(out, [-N_JUDGING])
     learned, judging = (_Holding(*map(jnp.asarray, part)) for part in zip(*parts, strict=True))
     keys = _keys(seed)
-    first = first_load_estimator(spec, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
+    first = first_load_estimator(arm, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
     network = _fit(first, _holding_loss, learned, keys[4], n_schedules=LOAD_SCHEDULES)
     # The network's own error. It is larger at the rim, so the intervals of 95 % of these poses shall hold it.
     found_kpa = holding(network, judging.spring_m).pressure_kpa

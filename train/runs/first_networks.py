@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from calib.arm import CalibratedArm
 from mjx_softarm._support.training import initial_layers
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import LoadedPool, Pool
@@ -43,12 +44,12 @@ def first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimato
 
 
 def first_load_estimator(
-    spec: ArmSpec, spring_m: Array, out: Array, covariance_kpa2: Array, key: Array
+    arm: CalibratedArm, spring_m: Array, out: Array, covariance_kpa2: Array, key: Array
 ) -> LoadEstimator:
     """Return the payload network of an arm, with the plane that fits its outputs best.
 
     Args:
-        spec: the arm.
+        arm: the arm, whose residual pressures tell the hysteresis.
         spring_m (n, n_springs) [m]: spring lengths.
         out (n, n_out): outputs of `LoadEstimator` there.
         covariance_kpa2 (n_sections, c, c): covariance of the residual pressures.
@@ -58,7 +59,8 @@ def first_load_estimator(
     springs = (spring_m - scaling["spring_centre_m"]) / scaling["spring_scale_m"]
     slope = jnp.linalg.lstsq(springs, out - centre)[0]
     rest = jnp.std(out - centre - springs @ slope, axis=0)
-    (n_in, n_out), own_kg = slope.shape, spec.mass.payload_kg
+    (n_in, n_out), own_kg = slope.shape, arm.spec.mass.payload_kg
+    held, at_chambers = arm.held, arm.spec.at_chambers
     return LoadEstimator(
         layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
         slope=slope,
@@ -67,8 +69,10 @@ def first_load_estimator(
         out_scale=jnp.maximum(rest, LEAST_REST),
         covariance_kpa2=covariance_kpa2,
         error_kpa2=jnp.zeros_like(covariance_kpa2),
+        hysteresis_kpa=jnp.asarray(at_chambers(0.0 if held is None else tuple(held.hysteresis_kpa))),
+        stroke_m=jnp.asarray(at_chambers(1.0 if held is None else tuple(held.stroke_m))),
         own_load_kg=jnp.asarray(own_kg),
-        load_scale_kg=jnp.asarray(own_kg + spec.mass.largest_payload_kg),
+        load_scale_kg=jnp.asarray(own_kg + arm.spec.mass.largest_payload_kg),
     )
 
 
