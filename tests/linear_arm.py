@@ -111,6 +111,8 @@ def load_estimator_of(spec, effect_kpa_per_kg, sd_kg=0.05):
         "out_scale": np.ones(n_out),
         "covariance_kpa2": covariance,
         "error_kpa2": 0.0 * covariance,
+        "hysteresis_kpa": np.zeros(spec.n_chambers),
+        "stroke_m": np.ones(spec.n_chambers),
         "own_load_kg": 0.0,
         "load_scale_kg": 1.0,
     }

@@ -104,12 +104,12 @@ def _process(
     centre, scale = state.mean(axis=0), np.maximum(state.std(axis=0), LEAST_SCALE)
     state, left_kpa = (state - centre) / scale, left_kpa[chosen].reshape(len(chosen), n_sections, -1)
     stop = stop[chosen].reshape(len(chosen), len(STROKES), n_sections, -1)
-    # Hysteresis of a process that does not know it: one stroke for all sections
+    # Hysteresis, beside a process that is fitted without it: one stroke for all sections
     fits = [_hysteresis(state[:, s], left_kpa[:, s], stop[:, :, s]) for s in range(n_sections)]
     best = int(np.argmax(np.sum([likelier for _, likelier in fits], axis=0)))
     most_kpa = np.array([kpa[best] for kpa, _ in fits])
     left_kpa = left_kpa - most_kpa[:, None] * stop[:, best]
-    # The process without it
+    # The process of what it leaves
     each = [_most_likely(state[:, s], left_kpa[:, s]) for s in range(n_sections)]
     length, noise, covariance = (np.array(x) for x in zip(*each, strict=True))
     fitted = length, noise, covariance, most_kpa, _strokes_m(spec)[best]

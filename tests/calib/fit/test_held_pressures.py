@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.fit.held_pressures import fit_held_pressures
+from calib.fit.held_pressures import fit_held_pressures, hysteresis_kpa
 from calib.fit.payload import PayloadPoses, choose_for_payload, payload_half_widths
 from mjx_softarm._support.archive import SealedFileError
 from mjx_softarm.control import allocation, chambers_of_springs
@@ -14,6 +14,7 @@ from mjx_softarm.sensing.held_pressures import (
     residual,
     save_pressures,
 )
+from mjx_softarm.sensing.hysteresis import stops
 from mjx_softarm.spec import ArmSpec, SpecError
 
 SPEC = ArmSpec.default()
@@ -50,6 +51,26 @@ def test_planted_laws_come_back_with_their_error(fit):
     off_kpa = found.mean_kpa - hardening(spring_m, simulated_kpa).reshape(found.mean_kpa.shape)
     deviation = np.sqrt(found.share[..., None] * np.diagonal(fit.held.covariance_kpa2, axis1=1, axis2=2))
     assert np.mean(np.abs(off_kpa) < 2.0 * deviation) > 0.9 and np.abs(off_kpa).mean() < 3 * NOISE_KPA
+
+
+def test_hysteresis_that_the_order_of_the_poses_shows_comes_back():
+    """A stop operator of another stroke than those of the fit, on top of the planted laws."""
+    spring_m, simulated_kpa, noise_kpa = poses()
+    measured_kpa = simulated_kpa + hardening(spring_m, simulated_kpa) + noise_kpa
+    by_way_kpa = 0.8 * stops(spring_m, np.full(N, 0.01))
+    fit = fit_held_pressures(SPEC, spring_m, measured_kpa + by_way_kpa, simulated_kpa)
+    np.testing.assert_allclose(fit.held.hysteresis_kpa, 0.8, rtol=0.25)
+    assert fit.expected_kpa < 0.4
+    found_kpa = hysteresis_kpa(SPEC, fit.held, spring_m)
+    assert np.sqrt(np.mean((found_kpa - by_way_kpa) ** 2)) < 0.5 * np.sqrt(np.mean(by_way_kpa**2))
+    # In another order the poses do not show it
+    shuffled = np.random.default_rng(1).permutation(len(spring_m))
+    rows = spring_m[shuffled], (measured_kpa + by_way_kpa)[shuffled], simulated_kpa[shuffled]
+    assert fit_held_pressures(SPEC, *rows).held.hysteresis_kpa.max() < 0.2
+
+
+def test_an_arm_without_hysteresis_gets_none(fit):
+    assert fit.held.hysteresis_kpa.max() < 0.5 * NOISE_KPA
 
 
 def test_far_from_the_poses_little_is_known_and_draws_differ_by_that(fit):
