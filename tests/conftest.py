@@ -130,7 +130,8 @@ def make_arm_model():
         n_out, blocks = 2 * spec.n_chambers + n_sections, (n_sections, spec.n_chambers // n_sections)
         plane = np.float32(0.1 * rng.normal(size=(n, n_out))), *scaling, row(-4.0, n_out), row(1.0, n_out)
         known = np.float32(np.tile(np.eye(blocks[1]), (n_sections, 1, 1)))
-        load = LoadEstimator(layers(n, 4, n_out), *plane, known, 0.1 * known, *kg)
+        hysteresis = row(0.7, spec.n_chambers), row(0.01, spec.n_chambers)
+        load = LoadEstimator(layers(n, 4, n_out), *plane, known, 0.1 * known, *hysteresis, *kg)
         springs = SpringModel(layers(spec.n_chambers, 5, n), *kpa, *scaling)
         poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
         n_in = N_POSE_INPUTS + n

@@ -204,9 +204,11 @@ def with_pressures(
     text = (
         f" The pressures that hold these poses are {held.before_kpa:.2f} kPa off the simulated ones (RMS, "
         f"held-out poses), and {held.after_kpa:.2f} kPa with a process of each section, which expects "
-        f"{held.expected_kpa:.2f} kPa."
+        f"{held.expected_kpa:.2f} kPa. A chamber that has grown holds up to "
+        f"{2.0 * held.held.hysteresis_kpa.max():.2f} kPa more than one that has shrunk to the same length."
     )
     figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
+    figures["hysteresis"] = float(held.held.hysteresis_kpa.max())
     # Tell how well payloads will be known.
     none_g, largest_g = (1e3 * kg for kg in widths_kg)
     text += (

@@ -11,8 +11,10 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.sensing.hysteresis import stop_after
 from tests.linear_arm import (
     GAIN_M_PER_KPA,
+    LAG,
     POLICY,
     REST_M,
     SPEC,
@@ -26,6 +28,7 @@ from tests.linear_arm import (
 
 STRETCH_M_PER_KG = 0.004  # of each spring, at held pressures
 SINK_M_PER_KG = 0.005  # of each section's end, at held springs
+HYSTERESIS_KPA, STROKE_M = 1.0, 0.004
 GOAL = np.array([0.0, 0.0, -585.0, 0.0, 0.0, 0.0])
 
 
@@ -89,6 +92,33 @@ def test_payload_is_estimated_at_rest_and_believed_in_the_pose(payload_kg):
     pose = estimate(LOADED.estimator, read_m(run.log)[-1], run.log.load_kg[-1])
     np.testing.assert_allclose(run.log.estimate[-1], pose, atol=1e-3)
     assert run.counts() == {}
+
+
+class Hysteretic(LinearArm):
+    """Chambers that have grown hold their length with more pressure than chambers that have shrunk."""
+
+    def __init__(self):
+        super().__init__()
+        self._stop, self._stroke_m = np.zeros(N), np.full(N, STROKE_M)
+
+    def holds(self, pressure_kpa):
+        before_m, held_kpa = self.spring_m, pressure_kpa - HYSTERESIS_KPA * self._stop
+        moved_m = LAG * GAIN_M_PER_KPA @ (held_kpa - self.actual_kpa)
+        self._stop = stop_after(self._stop, before_m + moved_m - self.spring_m, self._stroke_m)
+        return held_kpa
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_hysteresis_is_no_payload_where_it_is_known(known):
+    model = LOADED.load_estimator
+    if known:
+        both = np.full(N, HYSTERESIS_KPA, np.float32), np.full(N, STROKE_M, np.float32)
+        model = model._replace(hysteresis_kpa=both[0], stroke_m=both[1])
+    goals = [GOAL - [0.0, 0.0, 30.0, 0.0, 0.0, 0.0], GOAL, GOAL - [0.0, 0.0, 15.0, 0.0, 0.0, 0.0]]
+    policy = dataclasses.replace(LOADED, load_estimator=model)
+    run = follow(Hysteretic(), Controller.of(policy, plan_unloaded), goals)
+    told_kg = [run.log.load_kg[arrival.row] for arrival in run.arrivals]
+    assert np.abs(told_kg).max() < 0.03 if known else np.abs(told_kg).max() > 0.1
 
 
 _WIDE = (np.zeros((len(layouts(SPEC)["payload"]), N), np.float32), np.zeros(N, np.float32))

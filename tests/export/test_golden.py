@@ -58,7 +58,7 @@ def test_jax_agrees_on_all_single_rows(golden, controller):
 
     @jax.jit
     def answer(readings, goal):
-        return computations.answer(controller, readings, goal, unknown, 0.0, zeros, motion)
+        return computations.answer(controller, readings, goal, unknown, 0.0, zeros, zeros, motion)
 
     rows, outputs = without_memory(golden, answer)
     agreement = compare(golden, rows, outputs)

@@ -30,7 +30,8 @@ def estimator_of(rng, error=0.3, dtype=np.float32):
     scale = np.concatenate([np.full(N, 0.5), np.full(N, 0.1), np.full(3, 0.2)])
     plane = rng.normal(size=(N, n_out)), np.full(N, 0.2), np.full(N, 0.05), centre, scale
     known = half @ half.swapaxes(1, 2) + 0.5 * np.eye(3)
-    numbers = layers, *plane, known, np.tile(error * np.eye(3), (3, 1, 1)), 0.2, 0.8
+    hysteresis = rng.uniform(0.5, 1.0, N), np.full(N, 0.01)
+    numbers = layers, *plane, known, np.tile(error * np.eye(3), (3, 1, 1)), *hysteresis, 0.2, 0.8
     return LoadEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), numbers))
 
 
@@ -74,6 +75,18 @@ def test_pressures_that_a_payload_explains_tell_it():
         estimator._replace(error_kpa2=100 * estimator.error_kpa2), spring_m, pressure_kpa
     )
     assert (unknown_kg[1] > 2 * half_width_kg).all()
+
+
+def test_pressures_of_hysteresis_are_no_payload():
+    rng = np.random.default_rng(5)
+    estimator, spring_m = estimator_of(rng), rng.uniform(0.15, 0.25, (3, N))
+    pressure_kpa, stop = rng.uniform(-40.0, 20.0, (3, N)), rng.uniform(-1.0, 1.0, (3, N))
+    by_way_kpa = estimator.hysteresis_kpa * stop
+    with_it = estimate_load(estimator, spring_m, pressure_kpa + by_way_kpa, stop)
+    np.testing.assert_allclose(
+        with_it, estimate_load(estimator, spring_m, pressure_kpa), rtol=1e-4, atol=1e-4
+    )
+    assert (with_it[0] != estimate_load(estimator, spring_m, pressure_kpa + by_way_kpa)[0]).all()
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e8])
