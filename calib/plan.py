@@ -24,13 +24,8 @@ from calib.arm import CalibratedArm
 from calib.fit.equilibrium import N_KINDS, error_groups, simulate, unmeasured
 from calib.fit.leastsquares import QUANTILE
 from calib.fit.parameters import priors, tolerances
-from calib.fit.payload import (
-    choose_for_payload,
-    informed,
-    payload_half_widths,
-    payload_poses,
-    told_widths,
-)
+from calib.fit.payload import payload_half_widths, payload_poses, told_widths
+from calib.payload_plan import choose_for_payload, informed
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
 from mjx_softarm.control import allocation
 from mjx_softarm.mechanics.excitation import random_pressures

@@ -6,9 +6,6 @@ variance of the payload is the inverse of the information
 
     I = sum_s e_s^T V_s^-1 e_s / v_s.
 
-Poses that are recorded make v_s smaller around them, whatever pressures are measured there. So poses can be
-chosen before they are recorded.
-
 The log of an unloaded arm does not show e, but it shows how the tip rises with the springs. By the principle
 of virtual work, chambers of effective areas A that lift a payload at the height z do the work
 
@@ -28,7 +25,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.linalg import cho_factor, cho_solve
 
 from calib.arm import CalibratedArm
 from calib.fit.held_pressures import effective_area_m2, without_redundant_part
@@ -45,9 +41,7 @@ from mjx_softarm.sensing.held_pressures import (
     HeldPressures,
     covariances,
     factor_covariance,
-    kernel,
     residual,
-    sections_of,
 )
 from mjx_softarm.sensing.load import N_PASSES, QUANTILE
 from mjx_softarm.sensing.s2r import S2R, corrected
@@ -136,17 +130,6 @@ def told_widths(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tup
     return float(np.median(none)), float(np.quantile(largest, 0.95))
 
 
-def informed(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray) -> HeldPressures:
-    """Return a process that knows k poses more, whose residuals are its own means there."""
-    if not len(spring_m):
-        return held
-    state = (sections_of(spring_m, pressure_kpa, held.state.shape[1]) - held.centre) / held.scale
-    mean_kpa = residual(held, spring_m, pressure_kpa).mean_kpa
-    return held._replace(
-        state=np.concatenate([held.state, state]), residual_kpa=np.concatenate([held.residual_kpa, mean_kpa])
-    )
-
-
 def told_payload(
     arm: CalibratedArm, spring_m: np.ndarray, pressure_kpa: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -178,60 +161,3 @@ def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -
     share = residual(held, at.spring_m, at.pressure_kpa).share
     own = factor_covariance(effect.shape[1])
     return covariances(held, share) + effect[:, :, None] * own * effect[:, None]
-
-
-def choose_for_payload(
-    held: HeldPressures,
-    at: PayloadPoses,
-    spring_m: np.ndarray,
-    pressure_kpa: np.ndarray,
-    n: int,
-    taken: np.ndarray | None = None,
-) -> np.ndarray:
-    """Choose n poses to record that reduce the payload's mean variance most, one by one.
-
-    Args:
-        held: residual pressures known so far.
-        at: poses at which the payload is to be told.
-        spring_m (k, n_springs) [m]: spring lengths of the candidates.
-        pressure_kpa (k, n_chambers) [kPa]: pressures of the candidates.
-        n: number of poses.
-        taken: indices of candidates that are chosen already, and known to the process.
-
-    Returns:
-        Indices (n,) of candidates.
-    """
-    # Covariances (s, ...) of the sections' states given the recorded poses: candidates with all poses
-    options = np.concatenate([spring_m, at.spring_m]), np.concatenate([pressure_kpa, at.pressure_kpa])
-    states = (sections_of(*options, held.state.shape[1]) - held.centre) / held.scale
-    k, across = len(spring_m), []
-    for s, (length, noise) in enumerate(zip(held.length, held.noise, strict=True)):
-        rows, state = held.state[:, s], states[:, s]
-        factor = cho_factor(kernel(rows, rows, length) + noise * np.eye(len(rows)), lower=True)
-        known = kernel(rows, state, length)
-        across.append(kernel(state[:k], state, length) - known[:, :k].T @ cho_solve(factor, known))
-    covariance, strength = np.array(across), _strength(held, at)
-    share = residual(held, at.spring_m, at.pressure_kpa).share
-    own = np.arange(k)
-    chosen: list[int] = []
-    for _ in range(n):
-        # Variances (k, m, s) of the payload's poses with each candidate, then the best candidate
-        seen = covariance[:, own, own] + held.noise[:, None]  # (s, k)
-        less = covariance[:, :, k:] ** 2 / seen[..., None]  # (s, k, m)
-        after = np.maximum(share.T[:, None] - less, held.noise[:, None, None])
-        variance = 1.0 / np.sum(strength.T[:, None] / after, axis=0)  # (k, m)
-        variance = np.mean(variance, axis=1)
-        variance[[*chosen, *(() if taken is None else taken)]] = np.inf
-        best = int(np.argmin(variance))
-        chosen.append(best)
-        # Covariances given that one, too
-        share = after[:, best].T
-        covariance -= covariance[:, :, best, None] * (covariance[:, best] / seen[:, best, None])[:, None]
-    return np.array(chosen, int)
-
-
-def _strength(held: HeldPressures, at: PayloadPoses) -> np.ndarray:
-    """Return e_s^T V_s^-1 e_s (m, s) [1/kg^2]."""
-    effect = at.effect_kpa_per_kg.reshape(len(at.spring_m), *held.residual_kpa.shape[1:])
-    inverse = np.linalg.inv(held.covariance_kpa2)
-    return np.einsum("msi,sij,msj->ms", effect, inverse, effect)

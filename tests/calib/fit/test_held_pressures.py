@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from calib.fit.held_pressures import fit_held_pressures, hysteresis_kpa
-from calib.fit.payload import PayloadPoses, choose_for_payload, payload_half_widths
+from calib.fit.payload import PayloadPoses, payload_half_widths
+from calib.payload_plan import choose_for_payload
 from mjx_softarm._support.archive import SealedFileError
 from mjx_softarm.control import allocation, chambers_of_springs
 from mjx_softarm.sensing.held_pressures import (
