@@ -45,7 +45,7 @@ _ALWAYS = RewardConfig(
 
 # A policy of motion sees springs, pressures and pose at once. If all are exact in training, it takes errors
 # of a real arm's models for motion, and misses by centimetres.
-_INEXACT = dataclasses.replace(_MOVING.randomisation, sensor_noise_mm=2.0, stiffness_spread=0.1)
+_INEXACT = dataclasses.replace(_MOVING.randomisation, sensor_noise_mm=5.0, stiffness_spread=0.2)
 
 # Half-second actions of arms in motion. The discount sees the time that an arm takes to settle, and goals are
 # poses that the episode reached later. The critics observe what is predicted for two seconds.
