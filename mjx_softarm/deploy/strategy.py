@@ -240,7 +240,8 @@ def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
     last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
     motion = InMotion(before_m, last_m, belief.command.law.integral_kpa)
-    observed = sensed(controller.policy, belief.spring_m, motion, belief.load.believed_kg)
+    # The tip's velocity is that of poses at rest, now and before, also where `pose` is that of a moving arm
+    observed = sensed(controller.policy, belief.pose, belief.spring_m, motion, belief.load.believed_kg)
     return controller.plan(pose, target, belief.spring_m, observed)
 
 

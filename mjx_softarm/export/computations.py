@@ -65,7 +65,7 @@ def answer(
     stop = hysteresis_after(policy, stop, last_m, reading.length_m)
     told_kg, half_width_kg = estimate_load(policy.load_estimator, reading.length_m, pressure_kpa, stop)
     pose, away = tip_pose(policy, reading.length_m, load_kg)
-    observed = sensed(policy, reading.length_m, motion, load_kg)
+    observed = sensed(policy, pose, reading.length_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
     reference = policy.actions.readings(action)
     # NaN never counts as inside or finite.
@@ -150,7 +150,7 @@ def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]
     next_stop = hysteresis_after(policy, at.stop, last_m, at.spring_m)
     # Policy.
     motion = _in_motion(policy.spec)
-    observed = sensed(policy, at.spring_m, motion, at.load_kg)
+    observed = sensed(policy, at.pose, at.spring_m, motion, at.load_kg)
     action = action_towards(policy, at.pose, xp.asarray(at.goal, dtype=np.float32), observed)
     # Law.
     sizes = policy.spec.n_chambers, policy.spec.n_springs, policy.spec.n_springs

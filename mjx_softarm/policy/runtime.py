@@ -48,11 +48,14 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
     return pose, distance(policy.s2r, x) / policy.s2r.limit
 
 
-def sensed(policy: Policy, spring_m: Array, motion: InMotion, load_kg: Array | float) -> Array | None:
+def sensed(
+    policy: Policy, pose: Array, spring_m: Array, motion: InMotion, load_kg: Array | float
+) -> Array | None:
     """Return the entries (k,) that a policy observes besides pose and goal, float32; None if there are none.
 
     Args:
         policy: policy of any kind of observation.
+        pose (6,) [mm, deg]: tip pose, as `tip_pose` gives it.
         spring_m (n,) [m]: spring lengths.
         motion: earlier lengths, references and integral; used by policies that observe motion.
         load_kg () [kg]: estimated payload; clipped to the range of training for policies that observe it.
@@ -65,10 +68,9 @@ def sensed(policy: Policy, spring_m: Array, motion: InMotion, load_kg: Array | f
         return observe_payload(xp.clip(load_kg, least, most), policy.spec)
     known = motion.before_m, motion.last_reference_m
     before_m, last_m = (xp.where(xp.isfinite(x), x, spring_m) for x in known)
-    # Both at rest: the shape of a moving arm lags behind its springs in both
-    before_mm, now_mm = (tip_pose(policy, x, load_kg)[0][:3] for x in (before_m, spring_m))
+    before_mm = tip_pose(policy, before_m, load_kg)[0][:3]
     action = policy.actions.from_lengths(last_m)
-    observed = spring_m, before_m, now_mm, before_mm, motion.integral_kpa, action
+    observed = spring_m, before_m, pose[:3], before_mm, motion.integral_kpa, action
     return xp.asarray(observe_motion(*observed, policy.spec), dtype=np.float32)
 
 
