@@ -40,6 +40,8 @@ def busy_policy(spec=SPEC):
     )
     # 1 kPa less in every chamber than its springs show is half a kilogram
     load = load_estimator_of(spec, np.full(spec.n_chambers, -2.0))
+    hysteresis = np.full(spec.n_chambers, 0.1, np.float32), np.full(spec.n_chambers, 0.01, np.float32)
+    load = load._replace(hysteresis_kpa=hysteresis[0], stroke_m=hysteresis[1])
     networks = {"estimator": estimator, "load_estimator": load, "s2r": s2r}
     return dataclasses.replace(policy, layers=layers(18, 12, n, scale=0.5), **networks)
 
