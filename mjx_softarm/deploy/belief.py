@@ -125,7 +125,7 @@ def believe(
         stuck = stuck_springs(springs_m, window.pressure_kpa, n_sections, config)
         belief = replace(belief, at_rest=at_rest, stuck=stuck)
     if asked_m is not None and belief.known:
-        on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, tolerance_m))
+        on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, config))
         mask = saturated(in_force_kpa, asked_m, mean_m, gains, tolerance_m)
         # A chamber that is known to be lost has one pressure left
         held = np.less(gains.pressure_min_kpa, gains.pressure_max_kpa)
@@ -199,7 +199,7 @@ def still(spring_m: Array, config: LoopConfig = LOOP) -> Array:
 
 
 def on_reference(
-    springs_m: Array, reference_m: Array, pressure_kpa: Array, gains: Gains, tolerance_m: float
+    springs_m: Array, reference_m: Array, pressure_kpa: Array, gains: Gains, config: LoopConfig = LOOP
 ) -> Array:
     """Return whether each spring is on its reference, in the mean of a window, or its chamber at a limit.
 
@@ -211,14 +211,14 @@ def on_reference(
         reference_m (n_springs,) [m]: references.
         pressure_kpa (n_chambers,) [kPa]: commanded pressures.
         gains: numbers of the law.
-        tolerance_m: greatest error of a spring that counts as on its reference.
+        config: limits.
     """
     xp = array_namespace(springs_m, reference_m, pressure_kpa)
     off_m = xp.mean(springs_m, axis=0) - reference_m
     if gains.allocation is not None:
         off_m = allocated_error(-off_m, pressure_kpa, gains.allocation)
     at_limit = (pressure_kpa <= gains.pressure_min_kpa) | (pressure_kpa >= gains.pressure_max_kpa)
-    return xp.all((xp.abs(off_m) < tolerance_m) | at_limit)
+    return xp.all((xp.abs(off_m) < config.arrived_m) | at_limit)
 
 
 def stuck_springs(spring_m: Array, pressure_kpa: Array, n_sections: int, config: LoopConfig = LOOP) -> Array:

@@ -54,7 +54,7 @@ def start(controller: Controller) -> LoopState:
     """Return the state before the first tick, of an arm without pressure."""
     belief, spec = Belief.none(controller), controller.policy.spec
     watch = Watch(0, np.zeros(spec.n_springs, int), np.zeros(spec.n_chambers, int), belief.load.kg)
-    return LoopState(belief.command, belief, watch, strategy_of(controller.policy, np.zeros(6), moves=False))
+    return LoopState(belief.command, belief, watch, strategy_of(controller.policy, moves=False))
 
 
 def step(
@@ -129,7 +129,7 @@ def with_goal(
         near = ", ".join(f"{value:.0f}" for value in pose)
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
-    strategy = strategy_of(controller.policy, state.strategy.shift, moves=False)
+    strategy = strategy_of(controller.policy, moves=False)
     command = state.command._replace(n_ticks=0)
     return state._replace(goal=goal, lead=None, strategy=strategy, command=command), ()
 
@@ -139,7 +139,7 @@ def with_moving_goal(
 ) -> LoopState:
     """Return the state with the places (6,) [mm, deg] of a moving goal, now and ahead; all are reachable."""
     begins = state.lead is None
-    strategy = strategy_of(controller.policy, state.strategy.shift, moves=True) if begins else state.strategy
+    strategy = strategy_of(controller.policy, moves=True) if begins else state.strategy
     return state._replace(goal=goal, lead=lead, strategy=strategy)
 
 

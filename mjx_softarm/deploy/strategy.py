@@ -41,7 +41,7 @@ class Choice(NamedTuple):
 class AtRest(NamedTuple):
     """Actions of a policy for arms at rest: at once, then whenever the springs have settled."""
 
-    shift: np.ndarray  # (6,) [mm, deg]
+    shift: np.ndarray = np.zeros(6)  # [mm, deg]
     n_actions: int = 0
     acted_load: Load | None = None  # payload at the last action
 
@@ -58,17 +58,16 @@ class AtRest(NamedTuple):
         if _waits(belief, config.settle_timeout_s):
             return Choice(self)
 
+        events = unsettled(belief)
+        if self.n_actions == policy.n_actions:
+            return Choice(self, events=events, arrived=True)
+
         # Shifts that take all, or a share, of the error that the references leave.
         shifts, allowed = [self.shift], None
         if belief.settled:
             pose, left = _left(self, belief, goal)
             shifts = [_clipped(self.shift - share * left, config.shift_limit) for share in config.shares]
             allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
-
-        # The next action, or the arrival after the last one.
-        events = unsettled(belief)
-        if self.n_actions == policy.n_actions:
-            return _arrive(self, belief, shifts[0], events)
         return self._act(belief, goal, shifts, events, allowed)
 
     def _act(
@@ -89,29 +88,35 @@ class AtRest(NamedTuple):
                     continue
             after = AtRest(shift, self.n_actions + 1, belief.load)
             return Choice(after, reference_m, events)
-        return _arrive(self, belief, self.shift, events)
+        return Choice(self, events=events, arrived=True)
 
 
 class Timed(NamedTuple):
-    """Actions of a policy of motion: at regular times, whether the springs have settled or not."""
+    """Actions of a policy of motion: at regular times, whether the springs have settled or not.
 
-    shift: np.ndarray  # (6,) [mm, deg]
+    Its references lead the arm. The last ones, which stay, are to make the goal at rest: the goal is shifted
+    by a share of the error that they would leave, a few times.
+    """
+
     n_actions: int = 0
-    acted_load: Load | None = None  # payload at the last action
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act or wait; arrive once the springs have settled after the last action."""
         policy, config = belief.controller.policy, belief.controller.config
-        shift, is_last = self.shift, self.n_actions == policy.n_actions
-        if self.n_actions:
-            if _waits(belief, config.settle_timeout_s if is_last else policy.action_s):
-                return Choice(self)
-            if belief.settled:
-                shift = _clipped(shift - _left(self, belief, goal)[1], config.shift_limit)
-            if is_last:
-                return _arrive(self, belief, shift, unsettled(belief))
-        reference_m = _planned(belief, belief.pose, goal + shift)
-        after = Timed(shift, self.n_actions + 1, belief.load)
+        is_last = self.n_actions == policy.n_actions
+        if self.n_actions and _waits(belief, config.settle_timeout_s if is_last else policy.action_s):
+            return Choice(self)
+        if is_last:
+            return Choice(self, events=unsettled(belief), arrived=True)
+
+        # Act; correct the last references
+        after, shift = Timed(self.n_actions + 1), np.zeros(6)
+        reference_m = _planned(belief, belief.pose, goal)
+        for _ in range(config.n_corrections if after.n_actions == policy.n_actions else 0):
+            pose = np.asarray(pose_of(belief.controller, reference_m, belief.load)[0], float)
+            left = asked_error(pose, goal, policy.reward)
+            shift = _clipped(shift - config.correction_share * left, config.shift_limit)
+            reference_m = _planned(belief, belief.pose, goal + shift)
         return Choice(after, reference_m, extrapolated(belief))
 
 
@@ -156,7 +161,7 @@ class Predicting(NamedTuple):
     are due by the lag of the springs.
     """
 
-    shift: np.ndarray  # (6,) [mm, deg]
+    shift: np.ndarray = np.zeros(6)  # [mm, deg]
     n_actions: int = 0
     lengths_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
     shape: ShapeLag = ShapeLag()  # memory of an arm with these lengths
@@ -190,7 +195,6 @@ class Predicting(NamedTuple):
 class Chasing(NamedTuple):
     """Actions of a policy of motion towards a moving goal, each some time after the last."""
 
-    shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
     shape: ShapeLag = ShapeLag()
     way: WayError = WayError()
@@ -206,18 +210,18 @@ class Chasing(NamedTuple):
         waited_s = belief.command.n_ticks * controller.dt_s
         if belief.command.reference_m is not None and waited_s < policy.action_s:
             return Choice(after)
-        reference_m = _planned(belief, pose, goal + self.shift + after.way.correction)
+        reference_m = _planned(belief, pose, goal + after.way.correction)
         return Choice(after._replace(n_actions=self.n_actions + 1), reference_m)
 
 
 Strategy = AtRest | Timed | Predicting | Chasing
 
 
-def strategy_of(policy: Policy, shift: np.ndarray, moves: bool) -> Strategy:
-    """Return the strategy for a new goal, fixed or moving, that begins with a shift (6,) [mm, deg]."""
+def strategy_of(policy: Policy, moves: bool) -> Strategy:
+    """Return the strategy for a new goal, fixed or moving."""
     if policy.action_s:
-        return (Chasing if moves else Timed)(shift)
-    return (Predicting if moves else AtRest)(shift)
+        return Chasing() if moves else Timed()
+    return Predicting() if moves else AtRest()
 
 
 def _waits(belief: Belief, patience_s: float) -> bool:
@@ -225,12 +229,6 @@ def _waits(belief: Belief, patience_s: float) -> bool:
     if belief.settled:
         return bool(belief.suspect.any())  # whether a chamber is lost comes first
     return belief.command.n_ticks * belief.controller.dt_s < patience_s
-
-
-def _arrive(strategy: AtRest | Timed, belief: Belief, shift: np.ndarray, events: tuple[Event, ...]) -> Choice:
-    """Return the arrival, with the part of a shift (6,) [mm, deg] that the next goal keeps."""
-    kept = _clipped(shift, belief.controller.config.kept_limit)
-    return Choice(strategy._replace(shift=kept), events=events, arrived=True)
 
 
 def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -245,7 +243,7 @@ def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray
     return controller.plan(pose, target, belief.spring_m, observed)
 
 
-def _left(strategy: AtRest | Timed, belief: Belief, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _left(strategy: AtRest, belief: Belief, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose (6,) that the references make, and the error (6,) [mm, deg] that a shift is to correct.
 
     The payload's deflection is compensated once: by the policy's next action if it observes the payload, else

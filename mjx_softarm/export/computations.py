@@ -174,9 +174,9 @@ def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation
     """Record rest, faults, and the way that remains."""
     # Rest and faults.
     policy, config = controller.policy, controller.config
-    gains, tolerance_m, xp = policy.gains, policy.tolerance_m, array_namespace(at.pose)
-    settled = on_reference(at.springs_m, at.reference_m, at.pressure_kpa, gains, tolerance_m)
-    mask = saturated(at.pressure_kpa, at.reference_m, at.spring_m, gains, tolerance_m)
+    gains, xp = policy.gains, array_namespace(at.pose)
+    settled = on_reference(at.springs_m, at.reference_m, at.pressure_kpa, gains, config)
+    mask = saturated(at.pressure_kpa, at.reference_m, at.spring_m, gains, policy.tolerance_m)
     stuck = stuck_springs(at.springs_m, at.pressures_kpa, policy.spec.structure.n_sections, config)
     without = as_without(policy.spring_model, at.pressure_kpa, at.spring_m, config, gains.allocation)
     # Error of a pose, and lengths that references make.

@@ -65,7 +65,8 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "N_AVERAGED": N_AVERAGED,
         "LEAST_SHARE": repr(min(config.shares)),
         "MAX_SHIFT": ", ".join(map(repr, config.shift_limit.tolist())),
-        "MAX_KEPT": ", ".join(map(repr, config.kept_limit.tolist())),
+        "N_CORRECTIONS": config.n_corrections,
+        "CORRECTION_SHARE": repr(config.correction_share),
         "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),
     }
     # Fill the templates.

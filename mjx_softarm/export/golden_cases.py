@@ -34,7 +34,7 @@ _SHIFT = 0.01  # shift [mm, deg] under which these errors must stay clear, since
 _RUNS = ("calm", "lost", "stuck", "late", "leaking", "unplugged", "swinging", "heavy", "pressed", "dropping")
 _RUNS += ("shaken",)  # springs shake and a chamber leaks, so that it is lost in motion
 _RUN_TICKS = 400  # longest run
-_HEAVY, _PRESSED, _CARRIED = 1.45, 1.8, 0.8  # payloads of runs, as shares of the largest
+_HEAVY, _PRESSED, _CARRIED = 1.5, 1.8, 0.8  # payloads of runs, as shares of the largest
 _DROP_TICK = 200  # tick at which the carried payload falls, and the goal is given again
 _WEIGHT_MAX_KPA = 8.0  # largest pressure that stands for a payload
 

@@ -78,7 +78,7 @@ def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():
     plan, asked = asking(exact_plan, arm)
     run = go(arm, goals=GOALS[:1], controller=Controller.of(OF_MOTION, plan))
     assert len(run.arrivals) == 1 and not run.events
-    assert [tick for *_, tick in asked] == [0, 15, 30, 45]
+    assert [tick for *_, tick in asked] == [0, 15, 30] + (1 + LOOP.n_corrections) * [45]
     first, second = asked[0][3], asked[1][3]
     np.testing.assert_array_equal(first[9:21], 0.0)  # no rate of the springs, nor of the tip
     middle = 0.5 * (SPEC.springs.length_min_m + SPEC.springs.length_max_m)

@@ -84,12 +84,9 @@ def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):
     assert np.nanmax(np.abs(off_m[:, 2 + N : 2 + 2 * N])) > 1e-3  # so a payload was estimated, and counts
 
 
-def test_rows_of_a_policy_of_motion_agree_and_it_keeps_a_part_of_its_shift(tmp_path):
-    golden = agreeing_rows(moving_policy(), tmp_path, run_ticks=110)
-    begins, given = (np.flatnonzero(golden.inputs[:, FLAGS.index(name)]) for name in ("restart", "new_goal"))
-    [again] = np.setdiff1d(given, begins)
-    began = begins[begins < again].max()
-    assert golden.outputs[began:again, 1].any()  # it had arrived
+def test_rows_of_a_policy_of_motion_agree_and_it_arrives(tmp_path):
+    """So it took its last action, whose references are corrected."""
+    assert agreeing_rows(moving_policy(), tmp_path, run_ticks=160).outputs[:, 1].any()
 
 
 def test_a_tick_neither_allocates_nor_throws(folder):
