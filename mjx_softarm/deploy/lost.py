@@ -73,6 +73,6 @@ def without(controller: Controller, lost: np.ndarray) -> tuple[Controller, GoalS
 def begun_again(controller: Controller, state: LoopState) -> LoopState:
     """Return the state in which the goal of a run begins again with another controller."""
     watch = state.watch._replace(n_suspect=np.zeros_like(state.watch.n_suspect))
-    strategy = strategy_of(controller.policy, np.zeros(6), moves=False)
+    strategy = strategy_of(controller.policy, moves=False)
     command = state.command._replace(n_ticks=0)
     return state._replace(watch=watch, strategy=strategy, command=command)
