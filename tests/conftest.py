@@ -82,14 +82,14 @@ def env(spec):
 @pytest.fixture(scope="session")
 def reset(env):
     """Seed -> state of N_ARMS arms."""
-    jitted = xla.jit(jax.vmap(env.reset), env.uses_mjx)
+    jitted = xla.jit(jax.vmap(env.reset))
     return lambda seed: jitted(jax.random.split(jax.random.key(seed), N_ARMS))
 
 
 @pytest.fixture(scope="session")
 def step(env):
     """State and actions (N_ARMS, 9) -> state."""
-    return xla.jit(jax.vmap(env.step), env.uses_mjx)
+    return xla.jit(jax.vmap(env.step))
 
 
 @pytest.fixture

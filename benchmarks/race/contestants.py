@@ -55,9 +55,9 @@ class HeldOut:
 
         self.n_goals, self.n_actions = n_goals, N_ACTIONS
         self._paths = paths_of(env.sample_pool(n_goals, HELD_OUT_SEED).pose)  # (n_arms, k, 6)
-        self._start = xla.jit(jax.vmap(env.reset), env.uses_mjx)(start_keys(len(self._paths)))
-        self._towards = xla.jit(jax.vmap(functools.partial(towards, env)), env.uses_mjx)
-        self._step = xla.jit(jax.vmap(env.step), env.uses_mjx)
+        self._start = xla.jit(jax.vmap(env.reset))(start_keys(len(self._paths)))
+        self._towards = xla.jit(jax.vmap(functools.partial(towards, env)))
+        self._step = xla.jit(jax.vmap(env.step))
 
     def tip_error_mm(self, policy: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return the tip error at each goal (n_goals,), after the last action."""

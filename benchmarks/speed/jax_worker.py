@@ -71,9 +71,9 @@ def steps(engine: Any, mode: Any, n_arms: str) -> tuple[Facts, Callable[[], Fact
         with draws.on(mesh):
             return jax.lax.scan(step, state, jax.random.split(key, n_steps))
 
-    state, key = xla.jit(arms.reset, env.uses_mjx)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
+    state, key = xla.jit(arms.reset)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
     # Choose how often the rollout is called in a round.
-    compiled = xla.jit(rollout, env.uses_mjx)
+    compiled = xla.jit(rollout)
     repeats = repeats_for(lambda: compiled(state, key))
     # Tell where the arms of the first steps settled.
     facts: Facts = {}

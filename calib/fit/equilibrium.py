@@ -162,4 +162,4 @@ def _jacobian():
         slope, (error, left, chamber_m) = jax.jacfwd(errors, has_aux=True)(x)
         return error, slope, left < RESIDUAL_TOLERANCE, chamber_m
 
-    return xla.jit(jax.vmap(one, in_axes=(None, None, 0)), uses_mjx=False)
+    return xla.jit(jax.vmap(one, in_axes=(None, None, 0)))

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 NOT_CONVERGED = "the fit did not converge: start from a specification closer to the arm (--spec)"
 ROUNDS = ("linear", "huber", "huber")  # losses; the first round has the given scales
@@ -96,6 +95,8 @@ def descend(
         return np.concatenate([_scaled(*model(x), scale, problem)[1].reshape(-1, len(x)), prior])
 
     options: dict[str, Any] = {"jac": jacobian, "f_scale": problem.huber, "x_scale": problem.prior, **end}
+    from scipy.optimize import least_squares  # takes 0.3 s to import, and the training does not call it
+
     return least_squares(errors, x, loss=loss, **options).x
 
 

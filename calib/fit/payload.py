@@ -102,7 +102,7 @@ def _rises(n_at_once: int | None) -> Callable[..., Array]:
         simulated_m, real_m = (_height_m(at, params) for at in (frame, corrected(s2r, frame, end.spring_m)))
         return real_m - simulated_m
 
-    return xla.jit(jax.vmap(jax.grad(rise_m), in_axes=(0, None, None)), uses_mjx=False)
+    return xla.jit(jax.vmap(jax.grad(rise_m), in_axes=(0, None, None)))
 
 
 def _height_m(frame: tuple[Array, Array], params: ArmParams) -> Array:

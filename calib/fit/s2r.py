@@ -104,7 +104,7 @@ def _solver(n_at_once: int | None):
         at_sections = sections(kinematics(end.q), params, end.spring_m)
         return SimulatedPoses(pose, end.spring_m, end.pressure_kpa, end.settled, at_sections)
 
-    return xla.jit(jax.vmap(one, in_axes=(None, 0)), uses_mjx=False)
+    return xla.jit(jax.vmap(one, in_axes=(None, 0)))
 
 
 def fit_s2r(

@@ -93,4 +93,4 @@ def train_network(
         return best, losses
 
     keys = jax.random.split(key, n_epochs)
-    return jax.device_get(xla.jit(run, uses_mjx=False)(weights, keys, learned, stopping))
+    return jax.device_get(xla.jit(run, "networks")(weights, keys, learned, stopping))

@@ -1,4 +1,4 @@
-"""Compilation: options per platform, and the persistent cache of compiled programs."""
+"""Compilation: options by platform and kind of program, and the persistent cache of compiled programs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,21 +16,29 @@ import numpy as np
 # sums are wrong (see `small_matrices.product`).
 _CPU_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
-# Serial chains such as mjx.kinematics fall into a fusion trap of XLA's CPU emitters (jax >= 0.7), and
-# jaxlib 0.10 deadlocks on two cores with the concurrency-optimised scheduler.
-_CPU_MJX_OPTIONS = {
+# With XLA's fusion emitters (jax >= 0.7) an arm at rest takes twice as long to compile and is no faster, and
+# serial chains such as mjx.kinematics are far slower. Networks train a tenth faster with them. jaxlib 0.10
+# deadlocks on two cores with the concurrency-optimised scheduler and MJX.
+_CPU_ARM_OPTIONS = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_enable_concurrency_optimized_scheduler": False,
 }
 
+Kind = Literal["arm", "networks", "once"]
+_CPU_OPTIONS_OF: dict[Kind, dict[str, Any]] = {
+    "arm": _CPU_ARM_OPTIONS,
+    "networks": {},
+    "once": {**_CPU_ARM_OPTIONS, "xla_backend_optimization_level": 0},  # compiled in a quarter of the time
+}
+
 
 @functools.cache
-def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
+def compiler_options(kind: Kind = "arm") -> dict[str, Any]:
     """Return the options for `jax.jit` that the installed jaxlib accepts; none on other devices than CPUs."""
     if jax.default_backend() != "cpu":
         return {}
     accepted = {}
-    for name, value in {**_CPU_OPTIONS, **(_CPU_MJX_OPTIONS if uses_mjx else {})}.items():
+    for name, value in {**_CPU_OPTIONS, **_CPU_OPTIONS_OF[kind]}.items():
         try:
             with jax.ensure_compile_time_eval():  # works while a function is traced, too
                 jax.jit(lambda x: x + 1, compiler_options={name: value})(0)
@@ -40,12 +48,16 @@ def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
     return accepted
 
 
-def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
+def jit(function: Callable, kind: Kind = "arm", **kwargs: Any) -> Callable:
     """Compile with `jax.jit` and this platform's options; JAX raises inside a function that it traces.
 
-    MJX's options are for programs with MJX alone: networks train about a tenth slower with them.
+    Args:
+        function: function to compile.
+        kind: "networks" for programs that mostly train networks, without MJX; "once" for programs that run
+            once; "arm" for all others.
+        **kwargs: further arguments of `jax.jit`.
     """
-    return jax.jit(function, compiler_options=compiler_options(uses_mjx), **kwargs)
+    return jax.jit(function, compiler_options=compiler_options(kind), **kwargs)
 
 
 def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:
@@ -84,14 +96,14 @@ def in_chunks(function: Callable, n: int, n_chunks: int, batched: Any, arguments
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
 
 
-def jit_at_first_call(uses_mjx: bool = True, **kwargs: Any) -> Callable[[Callable], Callable]:
+def jit_at_first_call(**kwargs: Any) -> Callable[[Callable], Callable]:
     """Return a decorator that compiles as `jit` does, for functions of a module.
 
     Options are looked up at the first call, because a look-up at import would start JAX on a device.
     """
 
     def decorate(function: Callable) -> Callable:
-        compiled = functools.cache(lambda: jit(function, uses_mjx, **kwargs))
+        compiled = functools.cache(lambda: jit(function, **kwargs))
         return functools.wraps(function)(lambda *args, **keywords: compiled()(*args, **keywords))
 
     return decorate

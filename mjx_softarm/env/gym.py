@@ -67,8 +67,8 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._arms = VectorEnv(self.env, num_envs, max_episode_steps)
         self._state: State | None = None
-        self._reset_arms = xla.jit(self._arms.reset, self.env.uses_mjx)
-        self._step_arms = xla.jit(self._traced_step, self.env.uses_mjx, donate_argnums=0)
+        self._reset_arms = xla.jit(self._arms.reset)
+        self._step_arms = xla.jit(self._traced_step, donate_argnums=0)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode with every arm; a seed fixes all that follows. There are no options."""
@@ -218,7 +218,7 @@ _reach_env = functools.lru_cache(maxsize=8)(ReachEnv)
 def _compiled(arm: ArmSpec, config: EnvConfig) -> tuple:
     """Return reset and step of one arm, compiled once for all environments that share arm and config."""
     env = _reach_env(arm, config)
-    return xla.jit(env.reset, env.uses_mjx), xla.jit(env.step, env.uses_mjx)
+    return xla.jit(env.reset), xla.jit(env.step)
 
 
 def _reset_info(state: State) -> dict[str, Array]:

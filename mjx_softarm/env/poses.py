@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from mjx_softarm.env.config import EnvConfig
@@ -58,13 +59,16 @@ class PosePool:
             self._given.reset(before)
 
     def draw(self, seed: Seed) -> Pool:
-        """Draw as many poses as the pool has."""
+        """Draw as many poses as the pool has, onto the device."""
         n_even = round(self._config.even_share * self._config.n_poses)
         counts = (self._config.n_poses - n_even, False), (n_even, True)
         parts = [self.sample(n, seed, evenly) for n, evenly in counts if n]
-        return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
+        return jax.device_put(jax.tree.map(lambda *part: np.concatenate(part), *parts))
 
     def sample(self, n: int, seed: Seed, evenly: bool = False) -> Pool:
-        """Draw n poses with `sample_workspace` or `sample_evenly`, as they are observed."""
+        """Draw n poses with `sample_workspace` or `sample_evenly`, as they are observed, as NumPy arrays.
+
+        NumPy, because JAX compiles a program for each operation outside of a compiled function.
+        """
         pool = (sample_evenly if evenly else sample_workspace)(self._spec, n, seed)
-        return pool._replace(pose=self._observed(pool.pose, pool.spring_m))
+        return pool._replace(pose=np.float32(self._observed(pool.pose, pool.spring_m)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from mjx_softarm import control
@@ -72,12 +73,12 @@ class ReachEnv:
         self.spec = self.config.arm(spec or ArmSpec.default(), corrected=s2r is not None)
 
         # Parameters, law, actions and observations
-        self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
+        self.params = jax.device_put(ArmParams.from_spec(self.spec))
         self.scale = obs.ObsScale.from_spec(self.spec)
         self.gains = control.Gains.from_spec(self.spec)
         self.episode_motion = EpisodeMotion(self.spec, self.config)
         sensor, *limits = ActionMap.from_spec(self.spec)
-        self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
+        self.action_map = ActionMap(sensor, *jax.device_put([np.float32(limit) for limit in limits]))
         self.params = self.params._replace(contact=self.config.contact(self.spec))
         self.walls = Walls(self.config.pipe, self.spec, self.params, s2r)
 

@@ -73,7 +73,7 @@ class EpisodeMotion:
     def __init__(self, spec: ArmSpec, config: EnvConfig):
         self._spread, own = config.randomisation, spec.actuators.per_chamber(spec.n_chambers)
         self._regulated = isinstance(own, Regulator)
-        self._actuators: Any = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), own)
+        self._actuators: Any = jax.device_put(jax.tree.map(np.float32, own))
         self.n_draws = 6 if self._regulated else 3  # random numbers of an episode
 
         # Commands that wait at a time, and those of an arm at rest; an arm that is always at rest needs none

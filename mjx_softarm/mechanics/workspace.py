@@ -32,7 +32,7 @@ Seed = int | tuple[int, ...]
 
 
 class Pool(NamedTuple):
-    """Equilibria of the nominal arm at given pressures."""
+    """Equilibria of the nominal arm at given pressures, float32."""
 
     q: Array  # (n, nv) [m, rad, rad]
     pressure_kpa: Array  # (n, n_chambers)
@@ -56,7 +56,7 @@ def _solver(n_at_once: int | None):
     def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
         return settle_pressures(chain_kinematics(params), params, pressure_kpa, n_at_once)
 
-    return xla.jit(jax.vmap(solve, in_axes=(None, 0)), uses_mjx=False)
+    return xla.jit(jax.vmap(solve, in_axes=(None, 0)))
 
 
 @functools.cache
@@ -78,7 +78,7 @@ def _loaded_solver(n_at_once: int | None, by_law: bool = False):
         found = settle(kinematics, loaded, unloaded.spring_m, n_at_once)
         return found._replace(result=jnp.maximum(found.result, unloaded.result))
 
-    return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)), uses_mjx=False)
+    return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)))
 
 
 def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
@@ -136,7 +136,7 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     found = _in_batches(solver, spec, pressure_kpa, load_kg, *factors)
     rows = _chosen(spec, found, found.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
     pool = _pool(found, rows)
-    return LoadedPool(jnp.asarray(load_kg[rows], jnp.float32), pool.pressure_kpa, pool.spring_m, pool.pose)
+    return LoadedPool(np.float32(load_kg[rows]), pool.pressure_kpa, pool.spring_m, pool.pose)
 
 
 def sample_evenly(spec: ArmSpec, n: int, seed: Seed) -> Pool:
@@ -186,10 +186,9 @@ def _chosen(
 
 
 def _pool(found: Settled, chosen: np.ndarray) -> Pool:
-    """Return the chosen rows of equilibria with their poses."""
+    """Return the chosen rows of equilibria with their poses, as NumPy arrays."""
     pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])
-    arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
-    return Pool(*map(jnp.asarray, arrays))
+    return Pool(found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
 
 
 def extreme_poses(spec: ArmSpec) -> Settled:

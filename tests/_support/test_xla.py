@@ -13,14 +13,14 @@ pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="options 
     not jax.lib.__version__.startswith("0.10."), reason="it is of this version that it is known"
 )
 def test_the_library_of_jaxlib_0_10_is_off():
-    assert xla.compiler_options(uses_mjx=False)["xla_cpu_experimental_ynn_fusion_type"] == ""
+    assert xla.compiler_options("networks")["xla_cpu_experimental_ynn_fusion_type"] == ""
 
 
 def test_unknown_options_are_left_out(monkeypatch):
     monkeypatch.setattr(xla, "_CPU_OPTIONS", {"xla_no_such_option": True})
     xla.compiler_options.cache_clear()
     try:
-        assert xla.compiler_options(False) == {}
+        assert xla.compiler_options("networks") == {}
     finally:
         xla.compiler_options.cache_clear()
 
@@ -40,12 +40,12 @@ def test_options_can_be_asked_for_while_a_function_is_traced():
 
 def test_a_function_of_a_module_is_compiled_with_the_options_at_its_first_call(monkeypatch):
     asked = []
-    monkeypatch.setattr(xla, "compiler_options", lambda uses_mjx: asked.append(uses_mjx) or {})
+    monkeypatch.setattr(xla, "compiler_options", lambda kind: asked.append(kind) or {})
 
-    @xla.jit_at_first_call(uses_mjx=False, static_argnames="n")
+    @xla.jit_at_first_call(kind="networks", static_argnames="n")
     def power(x, n):
         return x ** len(range(n))  # which a traced n has not
 
     assert asked == []
     assert power(np.float32(3.0), n=2) == 9.0 and power(np.float32(2.0), n=3) == 8.0
-    assert asked == [False]
+    assert asked == ["networks"]

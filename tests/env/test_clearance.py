@@ -24,10 +24,10 @@ def test_in_motion_the_clearance_is_the_least_of_the_way(quick_compiler):
     keys = jax.random.split(jax.random.PRNGKey(0), 16)
     actions = jax.random.uniform(jax.random.PRNGKey(1), (16, long.action_size), minval=-1.0, maxval=1.0)
     start = xla.jit(jax.vmap(long.reset))(keys)
-    end = xla.jit(jax.vmap(long.step), long.uses_mjx)(start, actions)
+    end = xla.jit(jax.vmap(long.step))(start, actions)
     now, step = (
         start.replace(info=xla.jit(jax.vmap(short.reset))(keys).info),
-        xla.jit(jax.vmap(short.step), True),
+        xla.jit(jax.vmap(short.step)),
     )
     way = [(now := step(now, actions)).info["clearance_mm"] for _ in range(6)]
     np.testing.assert_allclose(end.pipeline_state.pose, now.pipeline_state.pose, atol=0.01)

@@ -223,7 +223,7 @@ def few(request, quick_compiler):
 def compiled(env):
     """Four arms, reset, and step."""
     keys = jax.random.split(jax.random.key(3), 4)
-    reset, step = (xla.jit(jax.vmap(function), env.uses_mjx) for function in (env.reset, env.step))
+    reset, step = (xla.jit(jax.vmap(function)) for function in (env.reset, env.step))
     return reset(keys), step
 
 

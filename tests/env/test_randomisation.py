@@ -28,7 +28,7 @@ def randomised(spec, env):
     """State of as many arms as the other fixtures', every kind of randomisation on."""
     spread = ReachEnv(spec, dataclasses.replace(env.config, randomisation=SPREAD))
     keys = jax.random.split(jax.random.key(0), env.config.n_poses)
-    return xla.jit(jax.vmap(spread.reset), spread.uses_mjx)(keys)
+    return xla.jit(jax.vmap(spread.reset))(keys)
 
 
 def assert_all_arms_have(drawn, nominal, name):
@@ -75,9 +75,9 @@ def test_payloads_go_up_to_the_arm_s_largest_where_they_are_observed(spec):
 def test_a_payload_is_observed_as_it_is_from_start_to_end(spec, quick_compiler):
     short_arm = spec.replace(structure={"n_sections": 1, "links_per_section": 2})
     env = ReachEnv(short_arm, EnvConfig(n_poses=64, observation="payload", randomisation=SPREAD))
-    start = xla.jit(jax.vmap(env.reset), env.uses_mjx)(jax.random.split(jax.random.key(0), 64))
+    start = xla.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
     actions = jax.random.uniform(jax.random.key(1), (64, env.action_size), minval=-1.0)
-    after = xla.jit(jax.vmap(env.step), env.uses_mjx)(start, actions)
+    after = xla.jit(jax.vmap(env.step))(start, actions)
     for state in (start, after):
         assert state.obs.shape == (64, env.observation_size)
         np.testing.assert_array_equal(state.obs[:, -1], start.pipeline_state.payload_kg)

@@ -60,7 +60,7 @@ def settled():
         found = settle(kinematics, params, reference)
         return found, ball_forces(CONTACT, kinematics(found.q))
 
-    return jax.tree.map(np.asarray, xla.jit(jax.vmap(one), False)(np.float32(references())))
+    return jax.tree.map(np.asarray, xla.jit(jax.vmap(one))(np.float32(references())))
 
 
 def energy(q):
@@ -223,7 +223,7 @@ def test_an_arm_in_motion_comes_to_rest_where_it_settles():
         motion, end = midpoint.advance(arm, motion, reference, gains, 8.0, 0.02, 0.02)
         return end, jnp.linalg.norm(ball_forces(CONTACT, chain_kinematics(params)(motion.q)), axis=0).sum()
 
-    end, force_n = xla.jit(jax.vmap(go), True)(reference)
+    end, force_n = xla.jit(jax.vmap(go))(reference)
     off_mm = 1e3 * np.linalg.norm(end.tip_position_m - found.tip_position_m[chosen], axis=-1)
     assert (end.result == 0).all() and off_mm.max() < 0.1
     np.testing.assert_allclose(force_n, push[chosen], atol=0.01)

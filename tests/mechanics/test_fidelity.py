@@ -103,7 +103,7 @@ def truth(n, seed, spec=SPEC):
 def settled(n, seed, spec=SPEC):
     """`settle` at the same references."""
     kinematics = chain_kinematics(params := ArmParams.from_spec(spec))
-    many = xla.jit(jax.vmap(lambda x: settle(kinematics, params, x)), uses_mjx=False)
+    many = xla.jit(jax.vmap(lambda x: settle(kinematics, params, x)))
     return jax.device_get(many(np.float32(references(n, seed, spec))))
 
 

@@ -157,14 +157,14 @@ def test_both_engines_settle_alike_and_have_the_same_derivative():
     params = ArmParams.from_spec(ONE)
     reference, turn = np.float32(references(ONE)), np.float32(directions(ONE)[1])
 
-    def both(kinematics, uses_mjx=False):
+    def both(kinematics):
         def one(reference, turn):
             return jax.jvp(lambda r: settle(kinematics, params, r), (reference,), (turn,))
 
-        return xla.jit(jax.vmap(one), uses_mjx)(reference, turn)
+        return xla.jit(jax.vmap(one))(reference, turn)
 
     chain, slope = both(chain_kinematics(params))
-    found, mjx_slope = both(MjxKinematics(mjx.put_model(build_model(ONE))), uses_mjx=True)
+    found, mjx_slope = both(MjxKinematics(mjx.put_model(build_model(ONE))))
     assert found.settled.all()
     np.testing.assert_allclose(found.tip_position_m, chain.tip_position_m, atol=1e-5)
     np.testing.assert_allclose(found.tip_rotation, chain.tip_rotation, atol=1.7e-4)

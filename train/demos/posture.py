@@ -76,7 +76,7 @@ def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmS
     ), wall_m
 
 
-@xla.jit_at_first_call(uses_mjx=False, static_argnames=("spec", "pipe"))
+@xla.jit_at_first_call(static_argnames=("spec", "pipe"))
 def look_many(
     pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None
 ) -> Posture:
@@ -84,7 +84,7 @@ def look_many(
     return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
 
 
-@xla.jit_at_first_call(uses_mjx=False, static_argnames=("spec", "pipe"))
+@xla.jit_at_first_call(static_argnames=("spec", "pipe"))
 def solve_many(
     starts_kpa: Array,
     target: PostureTarget,

@@ -98,7 +98,7 @@ def static_poses(env: ReachEnv, actions: np.ndarray) -> Pool:
     )
     still = ReachEnv(env.spec, config, env.s2r)
     begin = still.reset(jax.random.PRNGKey(0))
-    after = xla.jit(jax.vmap(still.step, in_axes=(None, 0)), still.uses_mjx)(begin, jnp.asarray(actions))
+    after = xla.jit(jax.vmap(still.step, in_axes=(None, 0)))(begin, jnp.asarray(actions))
     if not after.info["valid"].all():
         lost = ", ".join(map(str, np.flatnonzero(~after.info["valid"])))
         raise ConfigError(f"demonstrations: got rows {lost}, at which the arm does not settle, expected none")

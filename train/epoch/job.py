@@ -67,6 +67,11 @@ class TrainState(NamedTuple):
     n_epochs: Array  # () int32 epochs done; counts of env steps would overflow within hours
 
 
+def kind_of(env: ReachEnv, learner: Learner) -> xla.Kind:
+    """Return the kind of program that an epoch is: what most of its time goes to."""
+    return "arm" if env.uses_mjx or learner.own_arms else "networks"
+
+
 class Job:
     """Fixed parts of a run, and the two functions that change its state: `init` and `epoch`.
 
@@ -92,11 +97,11 @@ class Job:
         self.n_traces = 0
         self.sharding = None if mesh is None else _sharding(self.config, mesh, learner.own_arms)
         results = None if mesh is None else (self.sharding, everywhere(mesh))
-        self._init = xla.jit(self._drawing(self.first), env.uses_mjx, out_shardings=self.sharding)
+        self._init = xla.jit(self._drawing(self.first), "once", out_shardings=self.sharding)
         self._epoch = xla.jit(
-            self._drawing(self.advance), env.uses_mjx, donate_argnums=0, out_shardings=results
+            self._drawing(self.advance), kind_of(env, learner), donate_argnums=0, out_shardings=results
         )
-        self._thin = xla.jit(replay.thin, env.uses_mjx, donate_argnums=0)
+        self._thin = xla.jit(replay.thin, donate_argnums=0)
 
     def init(self, key: Array) -> TrainState:
         """Return the state that a run begins with."""

@@ -109,14 +109,14 @@ class Evaluator:
         self.env, self.learner, self.n_goals = nominal(env), learner, n_goals
         self.circle = np.asarray(circle_poses(env.spec))
         self._follow = xla.jit(
-            jax.vmap(follower(self.env, learner, n_actions), in_axes=(None, 0, 0)), env.uses_mjx
+            jax.vmap(follower(self.env, learner, n_actions), in_axes=(None, 0, 0))
         )
 
     @functools.cached_property
-    def goals(self) -> Array:
+    def goals(self) -> np.ndarray:
         """Both sets of held-out poses (2 n_goals, 6) [mm, deg], drawn on first use."""
         sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
-        return jnp.concatenate([poses.pose for poses in sets])
+        return np.concatenate([poses.pose for poses in sets])
 
     def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> Evaluator:
         """Return the same evaluation on another environment."""

@@ -97,7 +97,7 @@ class PositionEvaluator:
         self.moves = env.config.moves
         self.env = env if self.moves else nominal(env)
         go = self._around(n_actions) if self.moves else follower(self.env, learner, n_actions)
-        self._go = xla.jit(go, env.uses_mjx)
+        self._go = xla.jit(go)
 
     def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> PositionEvaluator:
         """Return the same evaluation on another environment."""

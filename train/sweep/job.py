@@ -27,7 +27,7 @@ from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.spec import ArmSpec
 from train.agent.registry import World, learner_of
 from train.config import ConfigError, TrainConfig
-from train.epoch.job import Job, TrainState
+from train.epoch.job import Job, TrainState, kind_of
 from train.epoch.poses import Poses
 
 # Groups of settings of the environment that are plain numbers, and single ones.
@@ -109,8 +109,8 @@ class SweepJob:
         self._pool_of = Poses(env, configs[0]).at  # all members share the poses of the first
         init = jax.vmap(self._init, in_axes=(0, 0, None), out_axes=_AXES)
         epoch = jax.vmap(self._epoch, in_axes=(_AXES, 0, None), out_axes=(_AXES, 0))
-        self._init_all = xla.jit(init, env.uses_mjx)
-        self._epoch_all = xla.jit(epoch, env.uses_mjx, donate_argnums=0)
+        self._init_all = xla.jit(init, "once")
+        self._epoch_all = xla.jit(epoch, kind_of(env, self.learner), donate_argnums=0)
         self._take = jax.jit(lambda tree, k: jax.tree.map(lambda x: x[k], tree))
         self._stack = jax.jit(lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees))
 
