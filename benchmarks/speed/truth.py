@@ -45,9 +45,7 @@ def settle_function(
         kinematics = MjxKinematics(mjx.put_model(build_model(spec)))
     else:
         kinematics = chain_kinematics(params)
-    return xla.jit(
-        over_arms(lambda r: solver.settle(kinematics, params, r, n_at_once), mesh), engine == "mjx"
-    )
+    return xla.jit(over_arms(lambda r: solver.settle(kinematics, params, r, n_at_once), mesh))
 
 
 @functools.lru_cache(maxsize=8)

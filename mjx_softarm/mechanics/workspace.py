@@ -41,9 +41,9 @@ class Pool(NamedTuple):
 
 
 class LoadedPool(NamedTuple):
-    """Equilibria of arms with payloads, whose chambers differ a little from the nominal arm's."""
+    """Equilibria of arms with payloads, whose chambers differ a little from the nominal arm's; float32."""
 
-    load_kg: Array  # (n,) payload
+    load_kg: np.ndarray  # (n,) payload
     pressure_kpa: Array  # (n, n_chambers)
     spring_m: Array  # (n, n_springs)
     pose: Array  # (n, 6) [mm, deg]
@@ -136,7 +136,7 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     found = _in_batches(solver, spec, pressure_kpa, load_kg, *factors)
     rows = _chosen(spec, found, found.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
     pool = _pool(found, rows)
-    return LoadedPool(np.float32(load_kg[rows]), pool.pressure_kpa, pool.spring_m, pool.pose)
+    return LoadedPool(load_kg[rows].astype(np.float32), pool.pressure_kpa, pool.spring_m, pool.pose)
 
 
 def sample_evenly(spec: ArmSpec, n: int, seed: Seed) -> Pool:

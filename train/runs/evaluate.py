@@ -136,7 +136,7 @@ class Evaluator:
         return summarise(workspace, even, circle, self.env.config.reward.threshold), workspace, circle
 
 
-def paths_of(goals: Array) -> np.ndarray:
+def paths_of(goals: Array | np.ndarray) -> np.ndarray:
     """Return goals (n, 6) as paths (n_arms, PATH, 6), in their order; the last one goes on with the first."""
     return np.resize(goals, (-(-len(goals) // PATH), PATH, 6))
 
