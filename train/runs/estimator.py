@@ -92,7 +92,7 @@ def distil(arm: CalibratedArm, seed: int) -> Distilled:
     spec, keys = arm.spec, _keys(seed)
     # Learn the pose of the arm as specified, then how a load changes it.
     pool = sample_workspace(_stronger(spec), N_TRAINING, seed)
-    load_kg = jnp.full(len(pool.pose), spec.mass.payload_kg)
+    load_kg = np.full(len(pool.pose), spec.mass.payload_kg, np.float32)
     poses = LoadedPool(load_kg, pool.pressure_kpa, pool.spring_m, pool.pose)
     loaded = loaded_poses(arm, N_TRAINING, seed)
     estimator = _fit(first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
