@@ -43,9 +43,8 @@ _ALWAYS = RewardConfig(
     goal_bonus=0.0, error_cost=0.0, step_cost=0.0, saturation_cost=10.0, distance_cost=200.0
 )
 
-# A policy of motion sees springs, pressures and pose at once. If all are exact in training, it takes errors
-# of a real arm's models for motion, and misses by centimetres.
-_INEXACT = dataclasses.replace(_MOVING.randomisation, sensor_noise_mm=5.0, stiffness_spread=0.2)
+# A policy of motion sees springs and pressures at once, whose relation differs on a real arm.
+_INEXACT = dataclasses.replace(_MOVING.randomisation, stiffness_spread=0.2)
 
 # Half-second actions of arms in motion. The discount sees the time that an arm takes to settle, and goals are
 # poses that the episode reached later. The critics observe what is predicted for two seconds.

@@ -94,8 +94,7 @@ class AtRest(NamedTuple):
 class Timed(NamedTuple):
     """Actions of a policy of motion: at regular times, whether the springs have settled or not.
 
-    Its references lead the arm. The last ones, which stay, are to make the goal at rest: the goal is shifted
-    by a share of the error that they would leave, a few times.
+    Its references lead the arm. The last ones stay, so they are to make the goal at rest; see `_last`.
     """
 
     n_actions: int = 0
@@ -103,20 +102,14 @@ class Timed(NamedTuple):
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act or wait; arrive once the springs have settled after the last action."""
         policy, config = belief.controller.policy, belief.controller.config
-        is_last = self.n_actions == policy.n_actions
-        if self.n_actions and _waits(belief, config.settle_timeout_s if is_last else policy.action_s):
+        is_over = self.n_actions == policy.n_actions
+        if self.n_actions and _waits(belief, config.settle_timeout_s if is_over else policy.action_s):
             return Choice(self)
-        if is_last:
+        if is_over:
             return Choice(self, events=unsettled(belief), arrived=True)
-
-        # Act; correct the last references
-        after, shift = Timed(self.n_actions + 1), np.zeros(6)
-        reference_m = _planned(belief, belief.pose, goal)
-        for _ in range(config.n_corrections if after.n_actions == policy.n_actions else 0):
-            pose = np.asarray(pose_of(belief.controller, reference_m, belief.load)[0], float)
-            left = asked_error(pose, goal, policy.reward)
-            shift = _clipped(shift - config.correction_share * left, config.shift_limit)
-            reference_m = _planned(belief, belief.pose, goal + shift)
+        after = Timed(self.n_actions + 1)
+        is_last = after.n_actions == policy.n_actions
+        reference_m = _last(belief, goal) if is_last else _planned(belief, belief.pose, goal)
         return Choice(after, reference_m, extrapolated(belief))
 
 
@@ -241,6 +234,25 @@ def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray
     # The tip's velocity is that of poses at rest, now and before, also where `pose` is that of a moving arm
     observed = sensed(controller.policy, belief.pose, belief.spring_m, motion, belief.load.believed_kg)
     return controller.plan(pose, target, belief.spring_m, observed)
+
+
+def _last(belief: Belief, goal: np.ndarray) -> np.ndarray:
+    """Return the last references (n_springs,) [m] of a policy of motion for a goal (6,) [mm, deg].
+
+    The goal is shifted by a share of the error that the references would leave at rest, several times. Those
+    that would leave the least count.
+    """
+    controller, policy, config = belief.controller, belief.controller.policy, belief.controller.config
+    shift, least, best_m = np.zeros(6), np.inf, belief.spring_m
+    for _ in range(1 + config.n_corrections):
+        reference_m = _planned(belief, belief.pose, goal + shift)
+        pose = np.asarray(pose_of(controller, reference_m, belief.load)[0], float)
+        error = float(weighted_error(pose, goal, policy.reward))
+        if error < least:
+            least, best_m = error, reference_m
+        left = asked_error(pose, goal, policy.reward)
+        shift = _clipped(shift - config.correction_share * left, config.shift_limit)
+    return best_m
 
 
 def _left(strategy: AtRest, belief: Belief, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
