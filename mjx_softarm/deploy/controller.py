@@ -44,8 +44,8 @@ class LoopConfig:
     shares: tuple[float, ...] = (1.0, 0.5, 0.25)
 
     # Last references of a policy of motion: number of corrections, each by this share of the error left.
-    # Stops of TQC on a twin, on a rod: 10 and 26 mm off without, 1.6 and 1.4 mm with these. With a share of 0.5
-    # they diverge on the rod, where poses move by several times as much as the goal is shifted.
+    # Stops of TQC on a twin, on a rod: 10 and 26 mm off without, 1.6 and 1.4 mm with these. By a half they
+    # diverge on the rod, where poses move by several times as much as the goal is shifted.
     n_corrections: int = 8
     correction_share: float = 0.3
 
