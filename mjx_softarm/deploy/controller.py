@@ -44,10 +44,10 @@ class LoopConfig:
     shares: tuple[float, ...] = (1.0, 0.5, 0.25)
 
     # Last references of a policy of motion: number of corrections, each by this share of the error left.
-    # Stops of TQC on a twin, on a rod: 10 and 26 mm off without, 1.6 and 1.4 mm with these. By a half they
-    # diverge on the rod, where poses move by several times as much as the goal is shifted.
-    n_corrections: int = 8
-    correction_share: float = 0.3
+    # Stops of TQC on a twin and two rods: 10, 26 and 73 mm off without, 1.6, 1.5 and 1.7 mm with these. Poses
+    # of a rod with slow regulators move by six times as much as the goal is shifted: by a half they diverge.
+    n_corrections: int = 16
+    correction_share: float = 0.15
 
     # Moving goals. Policies at rest: time over which the rate of the references is taken, for `spring_lag_s`
     rate_s: float = 0.2

@@ -226,14 +226,18 @@ def _waits(belief: Belief, patience_s: float) -> bool:
 
 def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the policy's references (n_springs,) [m] from a pose (6,) towards a target (6,) [mm, deg]."""
+    return belief.controller.plan(pose, target, belief.spring_m, _observed(belief))
+
+
+def _observed(belief: Belief) -> np.ndarray | None:
+    """Return what the policy observes besides pose and goal; see `sensed`."""
     controller = belief.controller
     lengths_m, last_m = belief.window.spring_m, belief.command.reference_m
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
     last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
     motion = InMotion(before_m, last_m, belief.command.law.integral_kpa)
     # The tip's velocity is that of poses at rest, now and before, also where `pose` is that of a moving arm
-    observed = sensed(controller.policy, belief.pose, belief.spring_m, motion, belief.load.believed_kg)
-    return controller.plan(pose, target, belief.spring_m, observed)
+    return sensed(controller.policy, belief.pose, belief.spring_m, motion, belief.load.believed_kg)
 
 
 def _last(belief: Belief, goal: np.ndarray) -> np.ndarray:
@@ -243,9 +247,9 @@ def _last(belief: Belief, goal: np.ndarray) -> np.ndarray:
     that would leave the least count.
     """
     controller, policy, config = belief.controller, belief.controller.policy, belief.controller.config
-    shift, least, best_m = np.zeros(6), np.inf, belief.spring_m
+    observed, shift, least, best_m = _observed(belief), np.zeros(6), np.inf, belief.spring_m
     for _ in range(1 + config.n_corrections):
-        reference_m = _planned(belief, belief.pose, goal + shift)
+        reference_m = controller.plan(belief.pose, goal + shift, belief.spring_m, observed)
         pose = np.asarray(pose_of(controller, reference_m, belief.load)[0], float)
         error = float(weighted_error(pose, goal, policy.reward))
         if error < least:
