@@ -86,7 +86,7 @@ def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):
 
 def test_rows_of_a_policy_of_motion_agree_and_it_arrives(tmp_path):
     """So it took its last action, whose references are corrected."""
-    assert agreeing_rows(moving_policy(), tmp_path, run_ticks=160).outputs[:, 1].any()
+    assert agreeing_rows(moving_policy(), tmp_path, run_ticks=260).outputs[:, 1].any()
 
 
 def test_a_tick_neither_allocates_nor_throws(folder):
