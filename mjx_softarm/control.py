@@ -202,7 +202,7 @@ def saturated(
         reference_m (..., n_springs) [m]: spring lengths to reach.
         length_m (..., n_springs) [m]: spring lengths read.
         gains: numbers of the law.
-        tolerance_m: greatest error of a spring that counts as on its reference.
+        tolerance_m: greatest error of a spring whose chamber, at a limit, is not saturated.
     """
     error_m = reference_m - length_m
     if gains.allocation is not None:

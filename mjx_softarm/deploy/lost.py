@@ -66,7 +66,9 @@ def without(controller: Controller, lost: np.ndarray) -> tuple[Controller, GoalS
     low_kpa, high_kpa = (np.where(lost, 0.0, x) for x in (gains.pressure_min_kpa, gains.pressure_max_kpa))
     gains = gains._replace(pressure_min_kpa=low_kpa, pressure_max_kpa=high_kpa)
     policy = dataclasses.replace(controller.policy, gains=gains)
-    config, search = dataclasses.replace(controller.config, go_on=False), GoalSearch(policy)
+    # The search makes the goal at rest: its references need no correction, which would take several ticks
+    config = dataclasses.replace(controller.config, go_on=False, n_corrections=0)
+    search = GoalSearch(policy)
     return dataclasses.replace(controller, policy=policy, plan=search.plan, config=config), search
 
 

@@ -7,8 +7,8 @@
     in motion  moving  `Chasing`     acts every `Policy.action_s` seconds
 
 A policy takes an arm as specified to a goal; one that observes the payload takes an arm with the estimated
-payload there. Other deviations leave an error, which shows once the springs have settled. It is subtracted
-from the next goal that the policy is given: the *shift* of the goal.
+payload there. Other deviations leave an error. At rest it shows once the springs have settled, and is
+subtracted from the next goal that the policy is given: the *shift* of the goal.
 """
 
 from __future__ import annotations

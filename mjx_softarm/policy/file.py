@@ -20,7 +20,7 @@ float64, networks and the workspace float32.
     rate_hz              ()           rate of the sensor-space law
     n_actions            () int       actions towards each goal, as in the evaluation of the run
     action_s             ()           time between two actions in motion; 0: the policy acts on arms at rest
-    tolerance_m          ()           greatest error of a spring that counts as on its reference
+    tolerance_m          ()           greatest error of a spring whose chamber, at a limit, is not saturated
     workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
     estimator.<field>                 `PoseEstimator`: spring lengths and payload to the simulated pose
     load_estimator.<field>            `LoadEstimator`: spring lengths to the pressures that hold them

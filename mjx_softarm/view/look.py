@@ -43,7 +43,7 @@ class Limits(NamedTuple):
 
     gains: Gains
     spring_m: tuple[np.ndarray, np.ndarray]  # (n_springs,) each
-    tolerance_m: float  # largest error of a spring that counts as on its reference
+    tolerance_m: float  # largest error of a spring whose chamber, at a limit, is not saturated
     n_sections: int
 
     @classmethod

@@ -143,6 +143,7 @@ def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():
     slow = Controller.of(dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec)))
     assert slow.window > 1.5 * CONTROLLER.window
     assert slow.config.still_m == pytest.approx(0.5 * CONTROLLER.config.still_m) == 1e-4
+    assert slow.config.arrived_m == pytest.approx(0.5 * CONTROLLER.config.arrived_m) == 1.25e-4
 
 
 def test_a_policy_of_motion_is_given_a_goal_two_actions_ahead():

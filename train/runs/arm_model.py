@@ -111,6 +111,5 @@ def _key(arm: CalibratedArm) -> str:
 def _workspace(spec: ArmSpec, s2r: S2R | None) -> np.ndarray:
     """Return poses (N_WORKSPACE, 6) of the real arm: half at random pressures, half uniform in volume."""
     halves = [sample(spec, N_WORKSPACE // 2, SEED) for sample in (sample_workspace, sample_evenly)]
-    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        poses = [p.pose if s2r is None else correct(s2r, p.pose, p.spring_m) for p in halves]
+    poses = [p.pose if s2r is None else correct(s2r, p.pose, p.spring_m) for p in halves]
     return np.concatenate(poses).astype(np.float32)
