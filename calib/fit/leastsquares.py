@@ -86,6 +86,8 @@ def descend(
     model: Model, x: np.ndarray, scale: np.ndarray, problem: Problem, loss: str, end: Mapping[str, Any]
 ) -> np.ndarray:
     """Minimise a loss of the errors from x (p,), with scales (n_groups,) that stay; `end` is SciPy's."""
+    from scipy.optimize import least_squares  # takes 0.3 s to import, and training imports this module
+
     model, prior = _remembering(model), np.diag(1.0 / problem.prior)
 
     def errors(x: np.ndarray) -> np.ndarray:
@@ -95,8 +97,6 @@ def descend(
         return np.concatenate([_scaled(*model(x), scale, problem)[1].reshape(-1, len(x)), prior])
 
     options: dict[str, Any] = {"jac": jacobian, "f_scale": problem.huber, "x_scale": problem.prior, **end}
-    from scipy.optimize import least_squares  # takes 0.3 s to import, and the training does not call it
-
     return least_squares(errors, x, loss=loss, **options).x
 
 

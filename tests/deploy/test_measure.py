@@ -49,7 +49,7 @@ def test_error_is_that_by_motion_capture(tmp_path):
     run = go(Seen(), tell=lines.append)
     found = measure(run, CONTROLLER, GOALS)
     unseen = found.error[:, :3] - found.believed[:, :3]
-    np.testing.assert_allclose(unseen.mean(axis=0), OFF_MM, atol=0.5)
+    np.testing.assert_allclose(unseen.mean(axis=0), OFF_MM, atol=0.2)
     assert np.abs(found.error[:, 3:]).max() < 0.5 and np.abs(found.believed[:, :3]).max() < 0.5
     assert not found.saturated.any() and (np.diff(found.arrival_s) > 0.0).all()
     assert len(lines) == 3 and all("mm off by motion capture" in line for line in lines[1:])
