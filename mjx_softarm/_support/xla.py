@@ -57,7 +57,21 @@ def jit(function: Callable, kind: Kind = "arm", **kwargs: Any) -> Callable:
             once; "arm" for all others.
         **kwargs: further arguments of `jax.jit`.
     """
-    return jax.jit(function, compiler_options=compiler_options(kind), **kwargs)
+    return jax.jit(_in_one_context(function), compiler_options=compiler_options(kind), **kwargs)
+
+
+def _in_one_context(function: Callable) -> Callable:
+    """Return the function, traced with an empty mesh set, which is the same as none.
+
+    JAX itself sets it where it takes gradients or batches, and traces what it has traced without it again.
+    """
+
+    @functools.wraps(function)
+    def traced(*args: Any, **kwargs: Any) -> Any:
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+            return function(*args, **kwargs)
+
+    return traced
 
 
 def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:

@@ -13,6 +13,7 @@ Shapes: B batch, O observation, A action, C critics, M quantiles per critic.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import flax.linen as nn
@@ -82,6 +83,7 @@ class PredictiveCritics:
             ahead.append(later[..., ERROR])
         return self.critics.apply(params["critics"], obs, action, jnp.stack(ahead, axis=-2))
 
+    @functools.partial(jax.jit, static_argnums=0)  # traced once for all that look ahead
     def after(self, predictor: Params, obs: Array, action: Array) -> Array:
         """Return the observation (..., O) that is predicted after an action (..., A)."""
         change = self.predictor.apply(predictor, obs, action)

@@ -253,6 +253,7 @@ class Job:
             now, later, ahead = replay.sample_ahead(state.memory, key, size, self.arms.n, n_later)
             return spread(self.mesh, now._replace(later_pose=later_pose(now, later, ahead)))
 
+        @jax.jit  # traced once for the branch and the shapes of its results
         def run(learner: Any) -> tuple[Any, dict[str, Array]]:
             learner, metrics = jax.lax.scan(
                 lambda learner, key: self.learner.update(learner, sample, key), learner, keys

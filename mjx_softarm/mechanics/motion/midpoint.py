@@ -97,6 +97,7 @@ def advance(
     return end, MotionEnd.of(end, Path.at(frames, springs.length), path)
 
 
+@jax.jit  # traced once for its three callers
 def _at(arm: MovingArm, q: Array) -> tuple[Frames, Tendons]:
     """Return the frames at joint coordinates (nv,), and both kinds of tendons as `all_tendons` does."""
     frames = chain_kinematics(arm.params)(q)
