@@ -54,7 +54,7 @@ class LoopConfig:
     lead_actions: int = 2  # policies of motion; circle in 10 s on a twin: 3.1 mm with it, 23.6 mm without
     # Share of the error along and beside the way by which the goal is corrected in a second. Circle in 20 s,
     # a policy of TQC in motion, which arrives early: 18.6 mm without, 6.5 mm with 0.3, 4.6 with this.
-    way_share_per_s: float = 0.6
+    way_share_per_s: float = 1.0
 
     # Payload, in largest payloads; by hand.
     load_known: float = 0.3  # greatest half-width of its 95 % interval with which it is believed

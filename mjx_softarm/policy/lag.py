@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_softarm.control import Gains
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.sensing.estimator import Frame, even_pose, expected_springs
+from mjx_softarm.sensing.estimator import Frame, estimate, even_pose, expected_springs
 from mjx_softarm.sensing.pose import pose_error
 
 _STEP = 0.05  # change of a pressure from which the springs' response is taken, in ranges of pressure
@@ -51,26 +51,27 @@ class ShapeLag(NamedTuple):
     """Memory of how unevenly the sections of a moving arm bend.
 
     The pose at rest with some springs differs from that of sections that bend evenly. In motion this
-    difference lags behind the springs, see `calib.fit.motion.shape`.
+    difference lags behind the springs, see `calib.fit.motion.shape`. Both poses are the simulation's: what
+    the sim-to-real network adds is not the weight's doing.
     """
 
-    uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first pose
+    uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first lengths
 
-    def after(self, policy: Policy, spring_m: np.ndarray, pose: np.ndarray, dt_s: float) -> ShapeLag:
-        """Return the memory a time dt_s later, at springs (n_springs,) [m] and their pose at rest (6,)."""
-        uneven = self._at_rest(policy, spring_m, pose)
+    def after(self, policy: Policy, spring_m: np.ndarray, load_kg: float, dt_s: float) -> ShapeLag:
+        """Return the memory a time dt_s later, at springs (n_springs,) [m] and a payload."""
+        uneven = self._at_rest(policy, spring_m, load_kg)
         if self.uneven is None:
             return ShapeLag(uneven)
         lag_s = policy.spec.backbone.shape_lag_s
         return ShapeLag(self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven))
 
-    def behind(self, policy: Policy, spring_m: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def behind(self, policy: Policy, spring_m: np.ndarray, load_kg: float) -> np.ndarray:
         """Return the pose (6,) [mm, deg] at rest minus the pose in motion; arguments as for `after`."""
-        uneven = self._at_rest(policy, spring_m, pose)
+        uneven = self._at_rest(policy, spring_m, load_kg)
         return np.zeros(6) if self.uneven is None else pose_error(uneven, self.uneven)
 
     @staticmethod
-    def _at_rest(policy: Policy, spring_m: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def _at_rest(policy: Policy, spring_m: np.ndarray, load_kg: float) -> np.ndarray:
         own = policy.estimator
-        base = Frame(own.base_position_m, own.base_rotation)
+        base, pose = Frame(own.base_position_m, own.base_rotation), estimate(own, spring_m, load_kg)
         return pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
