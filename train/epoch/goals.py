@@ -25,7 +25,8 @@ from mjx_softarm.mechanics.workspace import Pool
 from train.agent.imitation import ImitationConfig
 from train.config import ConfigError
 from train.demos.demonstrations import Demonstrations, shown_before
-from train.epoch.job import Job, TrainState
+from train.epoch.job import Job
+from train.epoch.state import TrainState
 
 EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they are reached
 NEXT_SHARE = 0.5  # share of the episodes in motion that start at the position shown before their goal

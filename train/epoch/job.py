@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +24,9 @@ from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.mechanics.workspace import Pool
 from train.agent.hindsight import later_pose
 from train.agent.learner import Experience, Explored, Learner, LearnerConfig
-from train.config import ConfigError
 from train.epoch import replay
-from train.epoch.devices import everywhere, split, spread
+from train.epoch.devices import everywhere, spread
+from train.epoch.state import TrainState, sharding_of
 
 T = TypeVar("T")
 COUNTS = ("env/unsettled", "env/episodes", "env/successes")  # metrics summed over an epoch and its arms
@@ -54,17 +54,6 @@ class WorkspaceGoals:
     def begin(self, state: Any, arms: State, key: Array) -> State:
         """Return the arms as they are."""
         return arms
-
-
-class TrainState(NamedTuple):
-    """All that a run consists of; with it, a run continues bit for bit."""
-
-    arms: Any  # State of n_arms, None where the learner has its own
-    learner: Any  # state of the learner
-    memory: Any  # Ring of Experience, None where the learner has its own arms
-    goals: Any  # state of the goals' distribution
-    key: Array
-    n_epochs: Array  # () int32 epochs done; counts of env steps would overflow within hours
 
 
 def kind_of(env: ReachEnv, learner: Learner) -> xla.Kind:
@@ -95,7 +84,7 @@ class Job:
         if not learner.own_arms:
             self.arms = VectorEnv(env, config.n_arms, self.config.episode_length, mesh)
         self.n_traces = 0
-        self.sharding = None if mesh is None else _sharding(self.config, mesh, learner.own_arms)
+        self.sharding = None if mesh is None else sharding_of(self.config, mesh, learner.own_arms)
         results = None if mesh is None else (self.sharding, everywhere(mesh))
         self._init = xla.jit(self._drawing(self.first), "once", out_shardings=self.sharding)
         self._epoch = xla.jit(
@@ -290,17 +279,3 @@ class Job:
 
 def _no_replay(key: Array, n_later: int = 0) -> Experience:
     raise TypeError("sample: got a call, expected none by a learner that steps arms of its own")
-
-
-def _sharding(config: Any, mesh: Mesh, own_arms: bool) -> TrainState:
-    """Return where the parts of a state are, as a prefix of its tree."""
-    for name in ("n_arms", *(() if own_arms else ("replay_capacity", "batch_size"))):
-        if getattr(config, name) % mesh.size:
-            raise ConfigError(
-                f"learner.{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
-            )
-    on_all, rows = cast(Any, everywhere(mesh)), split(mesh)  # in the places of arrays
-    everything: dict[str, Any] = dict.fromkeys(TrainState._fields, on_all)
-    everything["arms"] = None if own_arms else rows
-    everything["memory"] = None if own_arms else replay.Ring(data=rows, position=on_all, size=on_all)
-    return TrainState(**everything)

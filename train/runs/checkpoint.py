@@ -11,7 +11,7 @@ import jax
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.lazy import LazyModule
-from train.epoch.job import TrainState
+from train.epoch.state import TrainState
 
 if TYPE_CHECKING:
     import orbax.checkpoint as ocp

@@ -21,7 +21,7 @@ from train.agent.registry import LEARNERS, name_of
 from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
 from train.epoch.devices import is_first_process
-from train.epoch.job import TrainState
+from train.epoch.state import TrainState
 from train.runs.checkpoint import Checkpoints, RunError
 
 CONFIG_FILE, EVALUATION_FILE, METRICS_FILE = "config.json", "evaluation.json", "metrics.jsonl"

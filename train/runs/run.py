@@ -21,7 +21,7 @@ from mjx_softarm.env import ReachEnv
 from train.agent.learner import LearnerConfig
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
-from train.epoch.job import TrainState
+from train.epoch.state import TrainState
 from train.runs.checkpoint import RunError
 from train.runs.folder import EVALUATION_FILE, Run
 from train.runs.task import Task, task_of

@@ -27,8 +27,9 @@ from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.spec import ArmSpec
 from train.agent.registry import World, learner_of
 from train.config import ConfigError, TrainConfig
-from train.epoch.job import Job, TrainState, kind_of
+from train.epoch.job import Job, kind_of
 from train.epoch.poses import Poses
+from train.epoch.state import TrainState
 
 # Groups of settings of the environment that are plain numbers, and single ones.
 _ENV_GROUPS = {"env.reward": RewardConfig, "env.randomisation": Randomisation}

@@ -18,7 +18,7 @@ from calib.arm import CalibratedArm
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
 from train.config import TrainConfig
-from train.epoch.job import TrainState
+from train.epoch.state import TrainState
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 from train.runs.run import train_together

@@ -15,7 +15,7 @@ from tests.train.small import LEARNER
 from train.agent.analytic import AnalyticConfig
 from train.agent.registry import World, learner_of
 from train.config import TrainConfig
-from train.epoch.job import TrainState
+from train.epoch.state import TrainState
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 
