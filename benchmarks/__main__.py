@@ -38,6 +38,7 @@ BENCHMARKS = {
     "race": "benchmarks.race.race:race",
     "path": "benchmarks.accuracy.path:measure",
     "loads": "benchmarks.accuracy.loads:measure",
+    "lost": "benchmarks.accuracy.lost:measure",
     "printed": "benchmarks.accuracy.printed:measure",
     "paper": "benchmarks.paper.experiments:Paper",
     "confined": "benchmarks.accuracy.confined:measure",
