@@ -15,7 +15,7 @@ from mjx_softarm.sensing.pose import pose_error
 
 # Change of a pressure from which the springs' response is taken, in ranges of pressure. The slope of a
 # network differs by a third from place to place. Circle in 20 s, mean errors on a twin and two rods: 1.7, 1.9
-# and 3.4 mm with 0.05; 1.5, 1.4 and 1.8 mm with this; 1.5, 1.3 and 2.4 mm with one response for all pressures.
+# and 3.4 mm with 0.05; 1.5, 1.4 and 1.8 mm with this; 1.5, 1.3 and 2.4 mm with one response for all places.
 _STEP = 0.4
 _LEAST_MODE = 1e-3  # response of a mode, in that of the largest, below which chambers do not move it
 
