@@ -61,9 +61,10 @@ def jit(function: Callable, kind: Kind = "arm", **kwargs: Any) -> Callable:
 
 
 def _in_one_context(function: Callable) -> Callable:
-    """Return the function, traced with an empty mesh set, which is the same as none.
+    """Return the function, traced with the current mesh set explicitly.
 
-    JAX itself sets it where it takes gradients or batches, and traces what it has traced without it again.
+    Where there is none, JAX sets an empty one while it applies custom rules of derivatives. Its cache of
+    traces takes the two for different, and would trace helpers twice.
     """
 
     @functools.wraps(function)

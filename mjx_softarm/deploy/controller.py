@@ -53,8 +53,8 @@ class LoopConfig:
     rate_s: float = 0.2
     lead_actions: int = 2  # policies of motion; circle in 10 s on a twin: 3.1 mm with it, 23.6 mm without
     # Share of the error along and beside the way by which the goal is corrected in a second. Circle in 20 s,
-    # a policy of TQC in motion, which arrives early: 18.6 mm without, 5.3 mm with 0.6, 4.1 mm with this. With
-    # 2.5 policies at rest swing on rods.
+    # a policy of TQC in motion, which arrives early: 11.3 mm without, 5.3 mm with 0.6, 4.1 mm with this. At
+    # 2.5 per second, policies trained at rest oscillate on rods.
     way_share_per_s: float = 1.0
 
     # Payload, in largest payloads; by hand.

@@ -173,9 +173,7 @@ class Predicting(NamedTuple):
             pose, _ = pose_of(controller, length_m, belief.load)
             left = asked_error(np.asarray(pose, float), goal, policy.reward)
             shift = _clipped(shift - left, controller.config.shift_limit)
-        load_kg = belief.load.believed_kg
-        shape = self.shape.after(policy, length_m, load_kg, controller.dt_s)
-        behind = shape.behind(policy, length_m, load_kg)
+        shape, behind = self.shape.after(policy, length_m, belief.load.believed_kg, controller.dt_s)
 
         # Lengths due now, their rate, and the lag of springs that move so
         n_ticks = 2 * max(1, round(0.5 * controller.config.rate_s / controller.dt_s))
@@ -197,9 +195,9 @@ class Chasing(NamedTuple):
         """Act or wait."""
         # The pose in motion, and its error on the way
         controller, policy = belief.controller, belief.controller.policy
-        at = policy, belief.spring_m, belief.load.believed_kg
-        shape = self.shape.after(*at, controller.dt_s)
-        pose = belief.pose - shape.behind(*at)
+        load_kg = belief.load.believed_kg
+        shape, behind = self.shape.after(policy, belief.spring_m, load_kg, controller.dt_s)
+        pose = belief.pose - behind
         after = self._replace(shape=shape, way=self.way.after(goal, pose, controller))
         # The action that is due
         waited_s = belief.command.n_ticks * controller.dt_s

@@ -38,7 +38,7 @@ def law_lag_s(
     Args:
         gains: numbers of the law.
         springs: from pressures (2, n_chambers, n_chambers) [kPa] to lengths (2, n_chambers, n_springs) [m].
-        pressure_kpa (n_chambers,) [kPa]: pressures, at which G is taken.
+        pressure_kpa (n_chambers,) [kPa]: pressures, around which G is taken, also beyond the limits.
     """
     low, high = (np.broadcast_to(np.asarray(x, float), len(pressure_kpa)) for x in gains[4:6])
     step_kpa = _STEP * (high - low)
@@ -54,27 +54,30 @@ class ShapeLag(NamedTuple):
     """Memory of how unevenly the sections of a moving arm bend.
 
     The pose at rest with some springs differs from that of sections that bend evenly. In motion this
-    difference lags behind the springs, see `calib.fit.motion.shape`. Both poses are the simulation's: what
-    the sim-to-real network adds is not the weight's doing.
+    difference lags behind the springs, see `calib.fit.motion.shape`. Both poses are the simulation's: the
+    sim-to-real network's correction does not lag.
     """
 
     uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first lengths
 
-    def after(self, policy: Policy, spring_m: np.ndarray, load_kg: float, dt_s: float) -> ShapeLag:
-        """Return the memory a time dt_s later, at springs (n_springs,) [m] and a payload."""
-        uneven = self._at_rest(policy, spring_m, load_kg)
-        if self.uneven is None:
-            return ShapeLag(uneven)
-        lag_s = policy.spec.backbone.shape_lag_s
-        return ShapeLag(self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven))
+    def after(
+        self, policy: Policy, spring_m: np.ndarray, load_kg: float, dt_s: float
+    ) -> tuple[ShapeLag, np.ndarray]:
+        """Return the memory a time dt_s later, and the pose (6,) [mm, deg] at rest minus that in motion.
 
-    def behind(self, policy: Policy, spring_m: np.ndarray, load_kg: float) -> np.ndarray:
-        """Return the pose (6,) [mm, deg] at rest minus the pose in motion; arguments as for `after`."""
-        uneven = self._at_rest(policy, spring_m, load_kg)
-        return np.zeros(6) if self.uneven is None else pose_error(uneven, self.uneven)
-
-    @staticmethod
-    def _at_rest(policy: Policy, spring_m: np.ndarray, load_kg: float) -> np.ndarray:
+        Args:
+            policy: the arm.
+            spring_m (n_springs,) [m]: spring lengths then.
+            load_kg: payload.
+            dt_s: time since the last lengths.
+        """
+        # Difference at rest
         own = policy.estimator
         base, pose = Frame(own.base_position_m, own.base_rotation), estimate(own, spring_m, load_kg)
-        return pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
+        uneven = pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
+        # The arm begins at rest
+        if self.uneven is None:
+            return ShapeLag(uneven), np.zeros(6)
+        lag_s = policy.spec.backbone.shape_lag_s
+        now = self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven)
+        return ShapeLag(now), pose_error(uneven, now)

@@ -1,4 +1,4 @@
-"""State of a run: all that it consists of, and which parts of it several devices share out."""
+"""State of a run: all that it consists of, and how its parts are spread over devices."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ from mjx_softarm.mechanics.motion.state import (
     in_force,
     pushed,
 )
-from mjx_softarm.mechanics.params import N_PER_KPA_M2
+from mjx_softarm.mechanics.params import N_PER_KPA_M2, ArmParams
 from mjx_softarm.mechanics.statics import Tendons, all_tendons, chambers_and_springs, joined, statics_of
 
 
@@ -78,7 +78,7 @@ def advance(
 
     def tick(motion: Motion, _):
         """Run one control period: observe, let the law command pressures, take the time steps."""
-        frames, lines = _at(arm, motion.q)
+        frames, lines = _at(arm.params, motion.q)
         _, springs = chambers_and_springs(lines, arm.params)
         spring_m = springs.length
         command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
@@ -92,16 +92,16 @@ def advance(
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         tick = jax.checkpoint(tick, prevent_cse=False)  # a gradient recomputes each tick to save memory
         end, path = jax.lax.scan(tick, motion, None, length=round(duration_s / period_s))
-        frames, lines = _at(arm, end.q)
+        frames, lines = _at(arm.params, end.q)
         _, springs = chambers_and_springs(lines, arm.params)
     return end, MotionEnd.of(end, Path.at(frames, springs.length), path)
 
 
 @jax.jit  # traced once for its three callers
-def _at(arm: MovingArm, q: Array) -> tuple[Frames, Tendons]:
+def _at(params: ArmParams, q: Array) -> tuple[Frames, Tendons]:
     """Return the frames at joint coordinates (nv,), and both kinds of tendons as `all_tendons` does."""
-    frames = chain_kinematics(arm.params)(q)
-    return frames, all_tendons(frames, arm.params)
+    frames = chain_kinematics(params)(q)
+    return frames, all_tendons(frames, params)
 
 
 def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, period_s: float) -> Motion:
@@ -110,7 +110,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     v, params = motion.velocity, arm.params
     half_way = 0.5 * h * v  # (nv,)
     middle = motion._replace(q=motion.q + half_way)
-    frames, lines = _at(arm, middle.q)
+    frames, lines = _at(params, middle.q)
     chambers, _ = chambers_and_springs(lines, params)
 
     def volume_m3(displacement: Array) -> Array:
