@@ -23,7 +23,7 @@ FITTED_FROM = 512  # arms: below, an epoch's fixed costs count most
 
 
 def measure() -> dict[str, Any]:
-    """How do time and memory of an epoch grow with arms and devices? Twenty minutes."""
+    """How do time and memory of an epoch grow with arms and devices? Five minutes."""
     over_arms = _rows([(preset, n, 1) for preset, sizes in ARMS.items() for n in sizes])
     over_devices = _rows([("analytic", ARMS_ON_DEVICES, n) for n in DEVICES])
     fits = [{"preset": preset, **exponents(_of(preset, over_arms))} for preset in ARMS]
