@@ -23,6 +23,7 @@ from mjx_softarm.deploy.accuracy.measure import (
     figures,
     measure,
     read_goals,
+    ways_of,
     whole_goal,
     write_accuracy,
 )
@@ -196,16 +197,16 @@ def _tell_measured(
         out: folder to write to.
         payload_kg: payload at the gripper; None: do not say what makes the error.
     """
-    accuracy = measure(run, controller, poses)
+    accuracy, ways = measure(run, controller, poses), ways_of(run)
     found = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
-        **(along(run, controller.dt_s) if run.ways else {}),
+        **(along(ways, controller.dt_s) if ways else {}),
     }
     split = None if payload_kg is None else budget(run, controller, payload_kg)
     if split is not None:
         found["budget"] = split.figures()
-    if missing := write_accuracy(out, accuracy, found):
+    if missing := write_accuracy(out, accuracy, found, ways):
         print(missing)
     elif split is not None:
         draw(split, out / "budget.png")

@@ -204,20 +204,28 @@ def _norms(error: np.ndarray, asked: Sequence[bool]) -> tuple[np.ndarray, np.nda
     return away if any(asked[:3]) else away * np.nan, turned if any(asked[3:]) else turned * np.nan
 
 
-def along(run: LoopRun, dt_s: float) -> dict[str, float]:
-    """Return the tip's distances from a moving goal by motion capture, NaN where it was not seen.
+Way = tuple[np.ndarray, np.ndarray]  # tips by motion capture, NaN where not seen, and goals (n, 3) [mm] each
 
-    Returns:
-        Mean, 95 % and largest distance [mm] of tip and goal at the same time; the lag [s], up to
-        `MOST_LAG_S`, with the least mean distance, and this mean.
+
+def ways_of(run: LoopRun) -> list[Way]:
+    """Return tips and goals of the ticks of each way on which the goal moved.
 
     Raises:
         InputError: motion capture saw nothing.
     """
-    assert run.ways and run.log.goal is not None
+    assert run.log.goal is not None
     if run.log.tip_m is None:
         raise InputError(f"motion capture: got no frame in {len(run.log)} ticks, expected the tip")
-    ways = [(1e3 * run.log.tip_m[rows], run.log.goal[rows, :3]) for rows in run.ways]
+    return [(1e3 * run.log.tip_m[rows], run.log.goal[rows, :3]) for rows in run.ways]
+
+
+def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
+    """Return the tip's distances from a moving goal on one way or more; there is none without a frame.
+
+    Returns:
+        Mean, 95 % and largest distance [mm] of tip and goal at the same time; the lag [s], up to
+        `MOST_LAG_S`, with the least mean distance, and this mean.
+    """
     n = sum(len(goal) for _, goal in ways)
 
     def away_mm(lag: int) -> np.ndarray:
@@ -238,8 +246,12 @@ def along(run: LoopRun, dt_s: float) -> dict[str, float]:
     }
 
 
-def write_accuracy(folder: Path, accuracy: Accuracy, found: Mapping[str, Any]) -> str:
+def write_accuracy(
+    folder: Path, accuracy: Accuracy, found: Mapping[str, Any], ways: Sequence[Way] = ()
+) -> str:
     """Write `accuracy.json` and, with matplotlib, `accuracy.png`; return why there is no picture, or "".
+
+    The picture shows the ways, if there are any, else the goals at which the arm has come to rest.
 
     Raises:
         OSError: a file cannot be written.
@@ -253,22 +265,26 @@ def write_accuracy(folder: Path, accuracy: Accuracy, found: Mapping[str, Any]) -
     text = json.dumps({**numbers, "at": points}, indent=2, allow_nan=False)
     (folder / "accuracy.json").write_text(f"{text}\n", "utf-8")
 
-    # Goals and tips from above and from the side; shares of the goals below an error
+    # Goals and tips from above and from the side; shares of the goals, or of the time, below an error
     try:
         from matplotlib.figure import Figure
     except ImportError:
         return "no picture: matplotlib is not installed"
     figure = Figure(figsize=(10, 4), layout="constrained")
     above, side, shares = figure.subplots(1, 3)
-    seen = accuracy.goal[:, :3] + accuracy.error[:, :3]
+    seen, style, of_what = accuracy.goal[:, :3] + accuracy.error[:, :3], ".", "goals"
+    off = accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3]
+    if ways:
+        seen, style, of_what = np.concatenate([tip for tip, _ in ways]), "-", "time"
+        off = seen - np.concatenate([goal for _, goal in ways])
     for axes, (i, j) in ((above, (0, 1)), (side, (0, 2))):
         axes.plot(accuracy.goal[:, i], accuracy.goal[:, j], "o", mfc="none", label="goal")
-        axes.plot(seen[:, i], seen[:, j], ".", label="measured")
+        axes.plot(seen[:, i], seen[:, j], style, label="measured")
         axes.set(xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]")
         axes.set_aspect("equal", adjustable="datalim")
     above.legend(loc="upper right")
-    away = np.sort(np.linalg.norm(accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3], axis=1))
+    away = np.sort(np.linalg.norm(off[np.isfinite(off).all(axis=1)], axis=1))
     shares.plot(away, np.arange(1, len(away) + 1) / max(len(away), 1), drawstyle="steps-post")
-    shares.set(xlabel="translation error [mm]", ylabel="share of the goals below", ylim=(0, 1), xlim=0)
+    shares.set(xlabel="translation error [mm]", ylabel=f"share of the {of_what} below", ylim=(0, 1), xlim=0)
     figure.savefig(folder / "accuracy.png", dpi=150)
     return ""
