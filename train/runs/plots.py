@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from train.runs.evaluate import Reached
 from train.runs.positions import AtPositions
@@ -65,8 +65,9 @@ def _figure(width: float, *panels: tuple[str, str, str], height: float = 4.0) ->
 def logarithmic(axes: Any) -> None:
     """Make the y axis logarithmic, with plain numbers."""
     axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(LogFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _evaluations(
