@@ -51,7 +51,7 @@ class LoopConfig:
 
     # Moving goals. Policies at rest: time over which the rate of the references is taken, for `spring_lag_s`
     rate_s: float = 0.2
-    lead_actions: int = 2  # policies of motion; circle in 10 s on a twin: 3.1 mm with it, 23.6 mm without
+    lead_actions: int = 2  # policies of motion; `motion-analytic` in 20 s on a twin: 1.8 mm, with one 2.8 mm
     # Share of the error along and beside the way by which the goal is corrected in a second. Circle in 20 s,
     # a policy of TQC in motion, which arrives early: 11.3 mm without, 5.3 mm with 0.6, 4.1 mm with this. At
     # 2.5 per second, policies trained at rest oscillate on rods.

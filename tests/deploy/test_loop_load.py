@@ -187,40 +187,6 @@ def test_shift_ends_somewhere_and_the_next_goal_has_none_of_it(action_s):
     assert np.abs(asked_mm[:n_of_goal] - far[2]).max() == 25.0
 
 
-def test_the_last_references_of_a_policy_of_motion_make_the_goal_by_its_own_models():
-    """Its references miss goals by 3 mm and a third more than they are asked to move."""
-
-    def plan(pose, goal, spring_m, sensed):
-        asked_mm.append(goal[2] - GOAL[2])
-        off = GOAL + [0.0, 0.0, 3.0 + 1.33 * asked_mm[-1], 0.0, 0.0, 0.0]
-        return plan_unloaded(pose, off, spring_m, sensed)
-
-    asked_mm = []
-    of_motion = dataclasses.replace(LOADED, action_s=0.1)
-    run = follow(LinearArm(), Controller.of(of_motion, plan))
-    assert asked_mm[: of_motion.n_actions] == of_motion.n_actions * [0.0]
-    off_mm = (run.log.estimate - run.log.goal)[run.arrivals[0].row, 2]
-    assert asked_mm[-1] == pytest.approx(-3.0 / 1.33, abs=0.1) and abs(off_mm) < 0.3
-
-
-def test_a_policy_of_motion_makes_up_for_an_offset_beside_the_way_and_for_its_lag():
-    def plan(pose, goal, spring_m, sensed):
-        off_mm = 8.0 if goal[0] > 1.0 else 0.0  # from the first stop on
-        return plan_unloaded(pose, goal + [0.0, 0.0, off_mm, 0.0, 0.0, 0.0], spring_m, sensed)
-
-    of_motion = dataclasses.replace(LOADED, action_s=0.1)
-    aside = np.array([GOAL, GOAL + [20.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
-    run = trace(LinearArm(), Controller.of(of_motion, plan), aside, pace_s=20.0)
-    off_mm = (run.log.estimate - run.log.goal)[run.ways[0]]
-    assert abs(off_mm[100:250, 2]).max() > 4.0 and abs(off_mm[-300:, 2]).max() < 1.0
-    assert abs(off_mm[:, 0]).max() > 19.0  # this arm moves up and down alone
-
-    up = np.array([GOAL, GOAL + [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]])
-    run = trace(LinearArm(), Controller.of(of_motion, plan_unloaded), up, pace_s=10.0)
-    off_mm = abs((run.log.estimate - run.log.goal)[run.ways[0], 2])
-    assert off_mm.max() > 1.0 and off_mm[300:450].mean() < 0.3  # it lags by other than the two actions
-
-
 def test_saturated_chambers_shift_by_where_their_springs_are():
     plan, asked = asking(lambda *at: np.full(N, REST_M + 0.06))  # beyond what 20 kPa make
     longest_m = REST_M + GAIN_M_PER_KPA[0].sum() * POLICY.gains.pressure_max_kpa

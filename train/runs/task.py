@@ -20,8 +20,8 @@ from train.config import ConfigError, TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job
-from train.epoch.state import TrainState
 from train.epoch.poses import Poses
+from train.epoch.state import TrainState
 from train.runs.evaluate import N_GOALS, Evaluator
 from train.runs.positions import N_STARTS, PositionEvaluator
 
