@@ -108,9 +108,7 @@ class Evaluator:
     def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS, n_actions: int = N_ACTIONS):
         self.env, self.learner, self.n_goals = nominal(env), learner, n_goals
         self.circle = np.asarray(circle_poses(env.spec))
-        self._follow = xla.jit(
-            jax.vmap(follower(self.env, learner, n_actions), in_axes=(None, 0, 0))
-        )
+        self._follow = xla.jit(jax.vmap(follower(self.env, learner, n_actions), in_axes=(None, 0, 0)))
 
     @functools.cached_property
     def goals(self) -> np.ndarray:
