@@ -16,8 +16,8 @@ from benchmarks.speed.motion_worker import N_ARMS
 from benchmarks.speed.truth import QUANTILES
 from mjx_softarm import control
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
+from mjx_softarm.pneumatics import Pneumatics
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.twin.pneumatics import Pneumatics
 
 N_ROUNDS = 3
 TRUE_STEP_S = 2.5e-4

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm.control import Gains, LawState
+from mjx_softarm.deploy.lead import Plan, tip_lag_s
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import spring_lag_s
 from mjx_softarm.policy.reachable import Reachable
@@ -51,7 +52,6 @@ class LoopConfig:
 
     # Moving goals. Policies at rest: time over which the rate of the references is taken, for `spring_lag_s`
     rate_s: float = 0.2
-    lead_actions: int = 2  # policies of motion; `motion-analytic` in 20 s on a twin: 1.8 mm, with one 2.8 mm
     # Share of the error along and beside the way by which the goal is corrected in a second. Circle in 20 s,
     # a policy of TQC in motion, which arrives early: 11.3 mm without, 5.3 mm with 0.6, 4.1 mm with this. At
     # 2.5 per second, policies trained at rest oscillate on rods.
@@ -86,8 +86,6 @@ class LoopConfig:
 
 LOOP = LoopConfig()
 
-Plan = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
-
 
 @dataclass(frozen=True, eq=False)
 class Controller:
@@ -99,8 +97,6 @@ class Controller:
     dt_s: float
     window: int  # ticks
     observes_payload: bool
-    lead_s: float  # time by which a moving goal is given ahead of its time
-    start_s: float  # time until an arm at rest answers to a goal that begins to move
     config: LoopConfig
 
     @classmethod
@@ -111,11 +107,6 @@ class Controller:
         window, config = rest_of(
             policy.spec, spring_lag_s(policy, middle_kpa(gains, policy.spec.n_chambers)), config
         )
-        ahead_s = float(np.mean(gains.reference_s)) + 0.5 * config.rate_s
-        lead_s = config.lead_actions * policy.action_s or ahead_s
-        # The rate of the references is known after `rate_s`, and the actuators have a dead time
-        answer_s = config.rate_s + float(np.mean(policy.spec.actuators.delay_s))
-        start_s = 0.0 if policy.action_s else round(answer_s * policy.rate_hz) / policy.rate_hz
 
         return cls(
             policy=policy,
@@ -124,10 +115,27 @@ class Controller:
             dt_s=1.0 / policy.rate_hz,
             window=window,
             observes_payload=policy.observation == "payload",
-            lead_s=lead_s,
-            start_s=start_s,
             config=config,
         )
+
+    @cached_property
+    def lead_s(self) -> float:
+        """Time, of whole ticks, by which a moving goal is given ahead; takes a second to find, once."""
+        policy = self.policy
+        if policy.action_s:
+            return self._whole(max(0.0, tip_lag_s(policy, self.plan)))
+        return float(np.mean(policy.gains.reference_s)) + 0.5 * self.config.rate_s
+
+    @property
+    def start_s(self) -> float:
+        """Time, of whole ticks, until an arm at rest answers to a goal that begins to move."""
+        if self.policy.action_s:
+            return self.lead_s
+        # The rate of the references is known after `rate_s`, and the actuators have a dead time
+        return self._whole(self.config.rate_s + float(np.mean(self.policy.spec.actuators.delay_s)))
+
+    def _whole(self, time_s: float) -> float:
+        return round(time_s * self.policy.rate_hz) / self.policy.rate_hz
 
 
 def middle_kpa(gains: Gains, n_chambers: int) -> np.ndarray:

@@ -114,8 +114,8 @@ class OrderedGoals(ListedGoals):
 class Way:
     """A goal that moves past poses (p, 6), two or more, from stop to stop, as `trace` takes them.
 
-    It leaves a stop `Controller.start_s` after the arm has arrived there: references and actuators take this
-    time to answer. The way is not begun if any pose is refused.
+    It leaves a stop `Controller.start_s` after the arm has arrived there: policy, references and actuators
+    take this time to answer. The way is not begun if any pose is refused.
     """
 
     def __init__(
@@ -127,6 +127,7 @@ class Way:
         refused: Mapping[int, Event],
     ):
         self._controller, self._poses, self._pace_s = controller, np.asarray(goals, float), pace_s
+        self._lead_s = controller.lead_s  # found before the arm moves
         self._refused = refused
         self._stops = np.union1d(np.flatnonzero(stops), [0, len(goals) - 1])
         self._began_s, self._leg = 0.0, self._poses
@@ -157,9 +158,7 @@ class Way:
         self.ways[-1] = slice(row if stands else self.ways[-1].start, row)
         if now_s - self._began_s >= self._pace_s * (len(self._leg) - 1):
             return self._stop(state, note)
-        return with_moving_goal(
-            self._controller, state, self._at(now_s), self._at(now_s + self._controller.lead_s)
-        )
+        return with_moving_goal(self._controller, state, self._at(now_s), self._at(now_s + self._lead_s))
 
     def _stop(self, state: LoopState, note: Note) -> LoopState | None:
         """Return the state with the next stop as its goal; None where it is refused."""

@@ -20,6 +20,7 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.pneumatics import Pneumatics
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.instruments import (
@@ -33,7 +34,6 @@ from mjx_softarm.twin.instruments import (
 )
 from mjx_softarm.twin.model import build_twin, draw_parts, rotation_matrix
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
-from mjx_softarm.twin.pneumatics import Pneumatics
 
 # Losses of the paper's arm.
 # Chambers: four stops of equal force; together 3 % of the elastic force of the shortest chamber.

@@ -21,7 +21,7 @@ import numpy as np
 
 from mjx_softarm._support.fields import PerChamber, PerSection
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.pneumatics import Regulator
+from mjx_softarm.pneumatics import Pneumatics, Regulator
 from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
@@ -36,7 +36,6 @@ from mjx_softarm.twin.instruments import (
     drawn,
     scaled_tolerances,
 )
-from mjx_softarm.twin.pneumatics import Pneumatics
 from mjx_softarm.twin.rod import Rod, RodParts
 
 ELEMENTS_PER_SECTION = 6  # tip within 0.2 mm of that with twelve elements

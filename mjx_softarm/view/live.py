@@ -22,6 +22,7 @@ from mjx_softarm.deploy.ending import FAULT, LoopRun
 from mjx_softarm.deploy.goals import Orders
 from mjx_softarm.deploy.loop import LoopState, Tick
 from mjx_softarm.deploy.session import steer
+from mjx_softarm.deploy.strategy import AtRest, Timed
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.reachable import clamped
@@ -131,6 +132,7 @@ def place_poses(spec: ArmSpec) -> np.ndarray:
 def _doing(state: LoopState, n_actions: int) -> str:
     """Return the arm's activity as words that follow "the arm"."""
     if state.goal is not None:
+        assert isinstance(state.strategy, AtRest | Timed)  # a page's goals do not move
         return f"moves (action {max(state.strategy.n_actions, 1)} of {n_actions})"
     if state.command.reference_m is None:
         return "is being vented" if state.command.pressure_kpa.any() else "has no pressure"

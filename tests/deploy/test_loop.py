@@ -146,16 +146,16 @@ def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():
     assert slow.config.arrived_m == pytest.approx(0.5 * CONTROLLER.config.arrived_m) == 1.25e-4
 
 
-def test_a_policy_of_motion_is_given_a_goal_two_actions_ahead():
-    config = dataclasses.replace(
-        LOOP, way_share_per_s=0.0
-    )  # this arm's poses are not those of its references
+def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag():
+    config = dataclasses.replace(LOOP, way_share_per_s=0.0)  # this arm's poses are not its references'
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     plan, asked = asking(between, arm)
-    run = trace(arm, Controller.of(OF_MOTION, plan, config), goals, pace_s=10.0)
+    controller = Controller.of(OF_MOTION, plan, config)
+    run = trace(arm, controller, goals, pace_s=10.0)
+    assert 0.2 < controller.lead_s < 2.0
     begun = run.ways[0].start
     goal, tick = next((goal, tick) for _, goal, *_, tick in asked if tick > begun + 200)
-    ahead = on_the_way(goals, ((tick - begun) * CONTROLLER.dt_s + 0.6) / 10.0)
+    ahead = on_the_way(goals, ((tick - begun) * DT_S + controller.lead_s) / 10.0)
     np.testing.assert_allclose(goal, ahead, atol=0.003 * np.max(np.abs(goals[1] - goals[0])))  # a tick apart
 
 

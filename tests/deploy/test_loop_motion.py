@@ -35,7 +35,7 @@ def test_the_last_references_of_a_policy_of_motion_make_the_goal_by_its_own_mode
 
 def test_a_policy_of_motion_makes_up_for_an_offset_beside_the_way_and_for_its_lag():
     def plan(pose, goal, spring_m, sensed):
-        off_mm = 8.0 if goal[0] > 1.0 else 0.0  # from the first stop on
+        off_mm = 8.0 if goal[0] > 5.0 else 0.0  # from 5 s after the first stop on
         return straight(pose, goal + [0.0, 0.0, off_mm, 0.0, 0.0, 0.0], spring_m, sensed)
 
     of_motion = dataclasses.replace(POLICY, action_s=0.1)
@@ -48,4 +48,4 @@ def test_a_policy_of_motion_makes_up_for_an_offset_beside_the_way_and_for_its_la
     up = np.array([GOAL, GOAL + [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]])
     run = trace(LinearArm(), Controller.of(of_motion, straight), up, pace_s=10.0)
     off_mm = abs((run.log.estimate - run.log.goal)[run.ways[0], 2])
-    assert off_mm.max() > 1.0 and off_mm[300:450].mean() < 0.3  # it lags by other than the two actions
+    assert off_mm.max() > 1.0 and off_mm[300:450].mean() < 0.3  # its lag is not that of its models

@@ -27,7 +27,7 @@ from mjx_softarm.mechanics.motion.state import (
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.statics import all_tendons, chambers_and_springs
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.twin.pneumatics import Pneumatics
+from mjx_softarm.pneumatics import Pneumatics
 
 SPEC = ArmSpec.default()
 SHORT_ARM = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})

@@ -13,9 +13,8 @@ from calib.steps import actuators
 from mjx_softarm.deploy.record import record
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.pneumatics import Pump, Regulator
+from mjx_softarm.pneumatics import Pneumatics, Pump, Regulator
 from mjx_softarm.twin.instruments import Build
-from mjx_softarm.twin.pneumatics import Pneumatics
 from mjx_softarm.twin.rod_twin import RodTwin, draw_regulator
 
 TIME_S, PERIOD_S, STEPS = 60.0, 0.02, 4

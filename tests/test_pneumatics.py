@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_softarm.pneumatics import ATMOSPHERE_KPA, PAPER_PUMP, Pump, Regulator
-from mjx_softarm.twin.pneumatics import Pneumatics
+from mjx_softarm.pneumatics import ATMOSPHERE_KPA, PAPER_PUMP, Pneumatics, Pump, Regulator
 
 AREA_M2, SLOPE_M, REST_M, DT_S = 1.62e-3, -4.06e-3, 0.2, 0.001
 REGULATOR = Regulator(0.5, 0.2, fill_kpa_per_s=50.0, vent_kpa_per_s=20.0, deadband_kpa=0.3)
