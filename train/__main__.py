@@ -26,7 +26,7 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
-    # Programs that are traced leave many objects that stay: looking through them took a tenth of the start-up.
+    # Tracing leaves many objects that stay. To look through them time and again took a tenth of the start-up.
     gc.set_threshold(200_000)
     return cli.main("python -m train", "Train, evaluate and export policies.", COMMANDS, arguments)
 
