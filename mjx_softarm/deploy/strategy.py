@@ -187,7 +187,7 @@ class Chasing(NamedTuple):
     """Actions of a policy of motion towards a moving goal: one in each tick.
 
     It observes as its last action that of `Policy.action_s` seconds ago, as in training. Circle in 20 s, four
-    policies of TQC and two of `motion-analytic`: 3.0 and 1.6 mm, with an action every 0.5 s 3.5 and 1.8 mm.
+    policies of TQC and two of `motion-analytic`: 3.1 and 1.5 mm; with an action every 0.5 s 3.5 and 1.8 mm.
     """
 
     references_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
