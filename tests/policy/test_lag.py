@@ -5,11 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.strategy import WayError
 from mjx_softarm.policy.lag import ShapeLag, law_lag_s, spring_lag_s
 from mjx_softarm.sensing.estimator import estimate_frame
 from mjx_softarm.sensing.s2r import inputs
-from tests.linear_arm import CONTROLLER, DT_S, GAIN_M_PER_KPA, POLICY, SPEC, N
+from tests.linear_arm import DT_S, GAIN_M_PER_KPA, POLICY, SPEC, N
 from tests.networks import s2r_of
 
 
@@ -64,24 +63,3 @@ def test_the_shape_lags_by_the_time_constant_of_the_backbone_and_is_at_rest_with
     for _ in range(round(12.0 * lag_s / DT_S)):
         shape, behind = shape.after(policy, spring_m, load_kg, DT_S)
     np.testing.assert_allclose(behind, 0.0, atol=1e-3)
-
-
-def test_an_error_that_stays_beside_a_round_way_is_made_up_for():
-    """The tip is late, wide and high by constants in the axes of the way, less the correction of its goal."""
-    way, corrected = WayError(), []
-    n_lead, per_tick = round(CONTROLLER.lead_s / DT_S), 2 * np.pi / 20.0 * DT_S
-
-    def axes(k):
-        at = k * per_tick
-        outward = np.array([np.cos(at), np.sin(at), 0.0])
-        return outward, np.array([-np.sin(at), np.cos(at), 0.0]), np.array([0.0, 0.0, 1.0])
-
-    for k in range(1500):
-        now, ahead = (np.append(80.0 * axes(tick)[0], np.zeros(3)) for tick in (k, k + n_lead))
-        late = corrected[-n_lead] if len(corrected) >= n_lead else np.zeros(6)  # the correction is in force
-        outward, along, up = axes(k)
-        off_mm = 3.0 * outward - 4.0 * along + 2.0 * up
-        way = way.after(ahead, now + np.append(off_mm, np.zeros(3)) + late, CONTROLLER)
-        corrected.append(way.correction)
-    assert np.linalg.norm(off_mm + late[:3]) < 0.02 * np.linalg.norm(off_mm)
-    assert not corrected[n_lead].any() and not way.correction[3:].any()
