@@ -1,5 +1,7 @@
 """A linear arm whose every answer is known, a policy that is exact for it, and the loop that drives it."""
 
+import dataclasses
+
 import numpy as np
 
 from mjx_softarm import ArmSpec
@@ -164,6 +166,19 @@ def make_policy(spec=SPEC):
         s2r=None,
         provenance={},
     )
+
+
+def moves_aside(policy, aside_m=0.5):
+    """The policy of an arm whose tip moves aside as its last spring gets longer, which no even bend explains.
+
+    A payload of 1 kg doubles it.
+    """
+    (weights, bias), *_ = policy.estimator.layers
+    (load_weights, load_bias), *_ = policy.estimator.load_layers
+    by_springs, by_load = np.zeros_like(weights), np.zeros_like(load_weights)
+    by_springs[N - 1, -6] = by_load[N - 1, -6] = aside_m  # x of the last section's end [m/m], and per kg
+    layers = {"layers": ((by_springs, bias),), "load_layers": ((by_load, load_bias),)}
+    return dataclasses.replace(policy, estimator=policy.estimator._replace(**layers))
 
 
 POLICY = make_policy()

@@ -120,10 +120,10 @@ class Controller:
 
     @cached_property
     def lead_s(self) -> float:
-        """Time, of whole ticks, by which a moving goal is given ahead; takes a second to find, once."""
+        """Time by which a moving goal is given ahead; for a policy of motion it takes seconds to find."""
         policy = self.policy
         if policy.action_s:
-            return self._whole(max(0.0, tip_lag_s(policy, self.plan)))
+            return self._whole_ticks(max(0.0, tip_lag_s(policy, self.plan)))
         return float(np.mean(policy.gains.reference_s)) + 0.5 * self.config.rate_s
 
     @property
@@ -132,9 +132,9 @@ class Controller:
         if self.policy.action_s:
             return self.lead_s
         # The rate of the references is known after `rate_s`, and the actuators have a dead time
-        return self._whole(self.config.rate_s + float(np.mean(self.policy.spec.actuators.delay_s)))
+        return self._whole_ticks(self.config.rate_s + float(np.mean(self.policy.spec.actuators.delay_s)))
 
-    def _whole(self, time_s: float) -> float:
+    def _whole_ticks(self, time_s: float) -> float:
         return round(time_s * self.policy.rate_hz) / self.policy.rate_hz
 
 

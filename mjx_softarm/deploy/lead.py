@@ -43,13 +43,13 @@ def tip_lag_s(policy: Policy, plan: Plan) -> float:
         )
         swing = pose_error(last, first)
         goals = first + 0.5 * (1.0 - np.cos(phase))[:, None] * swing
-        along = _answer(policy, plan, ends_kpa[0], goals) @ swing[:3]
-        turn = -np.sum((along * np.exp(1j * phase))[-n_ticks:])
-        lags_s.append(np.angle(turn) / (2.0 * np.pi) * _SWING_S)
+        along = _tip_path(policy, plan, ends_kpa[0], goals) @ swing[:3]
+        phasor = -np.sum((along * np.exp(1j * phase))[-n_ticks:])  # of the tip, relative to the goal
+        lags_s.append(np.angle(phasor) / (2.0 * np.pi) * _SWING_S)
     return float(np.median(lags_s))
 
 
-def _answer(policy: Policy, plan: Plan, pressure_kpa: np.ndarray, goals: np.ndarray) -> np.ndarray:
+def _tip_path(policy: Policy, plan: Plan, pressure_kpa: np.ndarray, goals: np.ndarray) -> np.ndarray:
     """Return the tip's positions (t, 3) [mm] for goals (t, 6) of ticks, of an arm that begins at rest.
 
     The law, the actuators and the shape move in time; springs are those at rest with the pressures. Chambers
@@ -69,15 +69,16 @@ def _answer(policy: Policy, plan: Plan, pressure_kpa: np.ndarray, goals: np.ndar
     lengths_m, references_m, tip_mm, shape = [spring_m], [spring_m], [], ShapeLag()
     for goal in goals:
         shape, behind = shape.after(policy, spring_m, 0.0, dt_s)
-        pose = _pose(policy, spring_m) - behind
+        at_rest = _pose(policy, spring_m)
+        pose = at_rest - behind
         tip_mm.append(pose[:3])
         motion = InMotion(lengths_m[0], references_m[0], law.integral_kpa)
-        reference_m = plan(pose, goal, spring_m, sensed(policy, pose, spring_m, motion, 0.0))
+        reference_m = plan(pose, goal, spring_m, sensed(policy, at_rest, spring_m, motion, 0.0))
         command_kpa, law = pressures(reference_m, spring_m, law, policy.gains, dt_s)
         air.command(command_kpa)
         spring_m = _springs(policy, air.step(straight_m))
         lengths_m = [*lengths_m, spring_m][-1 - rate_ticks(policy.rate_hz) :]
-        references_m = [*references_m, reference_m][-round(policy.action_s / dt_s) :]
+        references_m = [*references_m, reference_m][-max(1, round(policy.action_s / dt_s)) :]
     return np.array(tip_mm)
 
 

@@ -157,7 +157,7 @@ class Chasing(NamedTuple):
     policies of TQC and two of `motion-analytic`: 3.1 and 1.5 mm; with an action every 0.5 s 3.5 and 1.8 mm.
     """
 
-    references_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
+    references_m: tuple[np.ndarray | None, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
     shape: ShapeLag = ShapeLag()
     way: WayError = WayError()
 
@@ -168,11 +168,13 @@ class Chasing(NamedTuple):
         shape, behind = self.shape.after(policy, belief.spring_m, load_kg, controller.dt_s)
         pose = belief.pose - behind
         way = self.way.after(goal, pose, controller)
-        observed = _observed(belief, self.references_m[0] if self.references_m else None)
+
+        # The last action that it observes, from those in force at the stop on
+        last_m = self.references_m or (belief.command.reference_m,)
+        observed = _observed(belief, last_m[0])
         reference_m = controller.plan(pose, goal + way.correction, belief.spring_m, observed)
-        n_ticks = round(policy.action_s / controller.dt_s)
-        references_m = (*self.references_m, reference_m)[-n_ticks:]
-        return Choice(Chasing(references_m, shape, way), reference_m)
+        n_ticks = max(1, round(policy.action_s / controller.dt_s))
+        return Choice(Chasing((*last_m, reference_m)[-n_ticks:], shape, way), reference_m)
 
 
 Strategy = AtRest | Timed | Predicting | Chasing

@@ -37,7 +37,7 @@ class WayError(NamedTuple):
     @property
     def correction(self) -> np.ndarray:
         """Correction (6,) [mm, deg] of the goal ahead."""
-        if len(self.goals) < 4:
+        if len(self.goals) < 3:
             return np.zeros(6)
         steps = (self.goals[2] - self.goals[1])[:3], (self.goals[-1] - self.goals[-2])[:3]
         return np.append(_turned(self.correction_mm, *steps), np.zeros(3))

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.lead import tip_lag_s
+from mjx_softarm.mdp.observation import RATE_S, TIP_MM_PER_S
 from mjx_softarm.policy.lag import spring_lag_s
-from tests.linear_arm import DT_S, POLICY, SPEC, N
+from mjx_softarm.policy.runtime import tip_pose
+from tests.linear_arm import DT_S, POLICY, SPEC, SPRINGS_M, N, moves_aside
 
 # Chambers of a section lengthen all its springs alike, so that the tip moves up and down
 _GAIN = np.kron(np.eye(SPEC.structure.n_sections), np.full((3, 3), 3e-4)).astype(np.float32)
@@ -39,3 +41,20 @@ def test_what_a_plan_waits_is_part_of_the_lag():
         return high(pose, kept[0], spring_m, sensed)
 
     assert tip_lag_s(OF_MOTION, late) - tip_lag_s(OF_MOTION, high) == pytest.approx(10 * DT_S, abs=1e-3)
+
+
+def test_the_rehearsal_tells_the_policy_of_motion_what_the_loop_tells_it():
+    """The tip's velocity is that of poses at rest; the pose itself lags."""
+    told = []
+
+    def noting(pose, goal, spring_m, sensed):
+        told.append((pose, tip_pose(policy, spring_m, 0.0)[0], sensed))
+        return SPRINGS_M[len(told) // 10 % 2]  # moves on, sometimes
+
+    policy = moves_aside(dataclasses.replace(POLICY, observation="motion", action_s=0.3))
+    tip_lag_s(policy, noting)
+    poses, at_rest, sensed = map(np.array, zip(*told[:200], strict=True))
+    moved_mm = at_rest[50:, :3] - at_rest[45:-5, :3]
+    velocity = slice(2 * N, 2 * N + 3)
+    np.testing.assert_allclose(sensed[50:, velocity] * TIP_MM_PER_S * RATE_S, moved_mm, atol=0.05)
+    assert np.abs(poses - at_rest).max() > 1.0

@@ -155,6 +155,11 @@ def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag():
     assert 0.2 < controller.lead_s < 2.0
     begun = run.ways[0].start
     goal, tick = next((goal, tick) for _, goal, *_, tick in asked if tick > begun + 200)
+    on_way = [(tick, sensed) for *_, sensed, tick in asked if begun < tick < begun + 200]
+    assert np.all(np.diff([tick for tick, _ in on_way]) == 1)  # an action in each tick
+    for tick_of, sensed in on_way[::20]:  # the last action is that of 0.3 s ago
+        then_m = run.log.reference_m[tick_of - 15]
+        np.testing.assert_allclose(POLICY.actions.lengths(sensed[-9:]), then_m, atol=1e-5)
     ahead = on_the_way(goals, ((tick - begun) * DT_S + controller.lead_s) / 10.0)
     np.testing.assert_allclose(goal, ahead, atol=0.003 * np.max(np.abs(goals[1] - goals[0])))  # a tick apart
 

@@ -8,7 +8,7 @@ import pytest
 from mjx_softarm.policy.lag import ShapeLag, law_lag_s, spring_lag_s
 from mjx_softarm.sensing.estimator import estimate_frame
 from mjx_softarm.sensing.s2r import inputs
-from tests.linear_arm import DT_S, GAIN_M_PER_KPA, POLICY, SPEC, N
+from tests.linear_arm import DT_S, GAIN_M_PER_KPA, POLICY, SPEC, N, moves_aside
 from tests.networks import s2r_of
 
 
@@ -24,19 +24,6 @@ def test_a_rough_response_of_the_springs_counts_by_its_mean_over_many_pressures(
         POLICY.gains, lambda kpa: (kpa + 4.0 / 3.0 * np.sin(kpa / 4.0)) @ GAIN_M_PER_KPA.T, np.zeros(N)
     )
     np.testing.assert_allclose(rough, smooth, atol=0.03 * abs(smooth).max())
-
-
-def moves_aside(policy, aside_m=0.5):
-    """The policy of an arm whose tip moves aside as its last spring gets longer, which no even bend explains.
-
-    A payload of 1 kg doubles it.
-    """
-    (weights, bias), *_ = policy.estimator.layers
-    (load_weights, load_bias), *_ = policy.estimator.load_layers
-    by_springs, by_load = np.zeros_like(weights), np.zeros_like(load_weights)
-    by_springs[N - 1, -6] = by_load[N - 1, -6] = aside_m  # x of the last section's end [m/m], and per kg
-    layers = {"layers": ((by_springs, bias),), "load_layers": ((by_load, load_bias),)}
-    return dataclasses.replace(policy, estimator=policy.estimator._replace(**layers))
 
 
 @pytest.mark.parametrize("load_kg", [0.0, 1.0])
