@@ -154,6 +154,8 @@ def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag():
     run = trace(arm, controller, goals, pace_s=10.0)
     assert 0.2 < controller.lead_s < 2.0
     begun = run.ways[0].start
+    waited_s = (begun - run.arrivals[0].row) * DT_S  # so the goal ahead begins at the stop
+    assert waited_s == pytest.approx(controller.lead_s, abs=2.5 * DT_S)
     goal, tick = next((goal, tick) for _, goal, *_, tick in asked if tick > begun + 200)
     on_way = [(tick, sensed) for *_, sensed, tick in asked if begun < tick < begun + 200]
     assert np.all(np.diff([tick for tick, _ in on_way]) == 1)  # an action in each tick
