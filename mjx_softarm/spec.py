@@ -17,7 +17,7 @@ import tomli_w
 
 from mjx_softarm._support.fields import PerChamber, PerSection, SpecError, check_counts, read_fields
 from mjx_softarm.arms import shipped_arm
-from mjx_softarm.pneumatics import ACTUATORS, PAPER_PUMP, Actuators
+from mjx_softarm.pneumatics import ACTUATORS, PAPER_PUMP, Actuators, Pneumatics
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
 from mjx_softarm.spec_tables import (
     LEAST_CHAMBERS,
@@ -90,6 +90,13 @@ class ArmSpec:
     def spring_sensor(self) -> Sensor:
         """The sensor with one calibration per spring."""
         return self.sensor.per_spring(self.n_springs)
+
+    def pneumatics(self, length_m: np.ndarray, timestep_s: float) -> Pneumatics:
+        """Return the air of chambers with lengths (n_chambers,) [m] at the start, stepped by `timestep_s`."""
+        area_m2, slope_m = map(self.per_chamber, (self.chambers.area_m2, self.chambers.area_slope_m))
+        rest_m, actuators = self.at_chambers(self.geometry.section_length_m), self.actuators
+        bellows = np.array(area_m2), np.array(slope_m), rest_m
+        return Pneumatics(*bellows, length_m, timestep_s, actuators.per_chamber(self.n_chambers))
 
     def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
         """Return one number per chamber, from a field with one number or one per chamber."""

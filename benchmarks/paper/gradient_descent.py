@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_softarm.deploy.lead import Plan
+from mjx_softarm.deploy.moving.lead import Plan
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import pose_error

@@ -16,7 +16,6 @@ from benchmarks.speed.motion_worker import N_ARMS
 from benchmarks.speed.truth import QUANTILES
 from mjx_softarm import control
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
-from mjx_softarm.pneumatics import Pneumatics
 from mjx_softarm.spec import ArmSpec
 
 N_ROUNDS = 3
@@ -76,10 +75,8 @@ def true_path_mm(
     data = mujoco.MjData(model)
     data.qpos[:] = q
     mujoco.mj_step1(model, data)
-    area, slope = np.array([*map(spec.per_chamber, (spec.chambers.area_m2, spec.chambers.area_slope_m))])
-    rest_m, n = spec.at_chambers(spec.geometry.section_length_m), spec.n_chambers
-    bellows = area, slope, rest_m, chamber_lengths(data, n)
-    air = Pneumatics(*bellows, TRUE_STEP_S, spec.actuators.per_chamber(n))
+    n = spec.n_chambers
+    air = spec.pneumatics(chamber_lengths(data, n), TRUE_STEP_S)
     air.hold(pressure_kpa, chamber_lengths(data, n))
 
     # The law at the control rate, MuJoCo's time steps between

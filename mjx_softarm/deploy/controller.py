@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.control import Gains, LawState
-from mjx_softarm.deploy.lead import Plan, tip_lag_s
+from mjx_softarm.deploy.moving.lead import Plan, tip_lag_s
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import spring_lag_s
 from mjx_softarm.policy.reachable import Reachable

@@ -20,8 +20,9 @@ from mjx_softarm.control import LawState, pressures
 from mjx_softarm.deploy.belief import Belief, believe
 from mjx_softarm.deploy.controller import Command, Controller
 from mjx_softarm.deploy.link import vented
+from mjx_softarm.deploy.moving.strategy import to_moving_goal
 from mjx_softarm.deploy.safety import Event, Fault, Watch, check, stop_of
-from mjx_softarm.deploy.strategy import Strategy, strategy_of
+from mjx_softarm.deploy.strategy import Strategy, to_fixed_goal
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.policy.reachable import nearest
@@ -54,7 +55,7 @@ def start(controller: Controller) -> LoopState:
     """Return the state before the first tick, of an arm without pressure."""
     belief, spec = Belief.none(controller), controller.policy.spec
     watch = Watch(0, np.zeros(spec.n_springs, int), np.zeros(spec.n_chambers, int), belief.load.kg)
-    return LoopState(belief.command, belief, watch, strategy_of(controller.policy, moves=False))
+    return LoopState(belief.command, belief, watch, to_fixed_goal(controller.policy))
 
 
 def step(
@@ -129,7 +130,7 @@ def with_goal(
         near = ", ".join(f"{value:.0f}" for value in pose)
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
-    strategy = strategy_of(controller.policy, moves=False)
+    strategy = to_fixed_goal(controller.policy)
     command = state.command._replace(n_ticks=0)
     return state._replace(goal=goal, lead=None, strategy=strategy, command=command), ()
 
@@ -139,7 +140,7 @@ def with_moving_goal(
 ) -> LoopState:
     """Return the state with the places (6,) [mm, deg] of a moving goal, now and ahead; all are reachable."""
     begins = state.lead is None
-    strategy = strategy_of(controller.policy, moves=True) if begins else state.strategy
+    strategy = to_moving_goal(controller.policy) if begins else state.strategy
     return state._replace(goal=goal, lead=lead, strategy=strategy)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.loop import LoopState, refusal
 from mjx_softarm.deploy.safety import Event
-from mjx_softarm.deploy.strategy import strategy_of
+from mjx_softarm.deploy.strategy import to_fixed_goal
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import N_STEPS, begin, best_of, improve, nearest_of, springs_of
 
@@ -75,6 +75,6 @@ def without(controller: Controller, lost: np.ndarray) -> tuple[Controller, GoalS
 def begun_again(controller: Controller, state: LoopState) -> LoopState:
     """Return the state in which the goal of a run begins again with another controller."""
     watch = state.watch._replace(n_suspect=np.zeros_like(state.watch.n_suspect))
-    strategy = strategy_of(controller.policy, moves=False)
+    strategy = to_fixed_goal(controller.policy)
     command = state.command._replace(n_ticks=0)
     return state._replace(watch=watch, strategy=strategy, command=command)

@@ -16,10 +16,11 @@ import numpy as np
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import Arrival, LoopRun, vent_at_end
-from mjx_softarm.deploy.goals import Goals, ListedGoals, OrderedGoals, Pilot, Way
+from mjx_softarm.deploy.goals import ListedGoals, OrderedGoals, Pilot
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, step
 from mjx_softarm.deploy.lost import begun_again, without
+from mjx_softarm.deploy.moving.way import Way
 from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, lost_chambers, names
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import weighted_error
@@ -105,7 +106,7 @@ class _Session:
         self,
         arm: ArmIO,
         controller: Controller,
-        goals: Goals,
+        goals: ListedGoals | Way,
         tell: Callable[[str], None],
         arrived: Callable[[int], None] = lambda goal: None,
         look: Callable[[LoopState, Tick, dict[str, Any]], None] = lambda state, tick, row: None,

@@ -3,8 +3,7 @@
     policy     goal    strategy
     at rest    fixed   `AtRest`      acts at once, then each time the springs have settled
     in motion  fixed   `Timed`       acts every `Policy.action_s` seconds
-    at rest    moving  `Predicting`  acts several times in each tick, each time from a predicted pose
-    in motion  moving  `Chasing`     acts in each tick
+    either     moving                see `mjx_softarm.deploy.moving.strategy`
 
 A policy takes an arm as specified to a goal; one that observes the payload takes an arm with the estimated
 payload there. Other deviations leave an error. At rest it shows once the springs have settled, and is
@@ -13,20 +12,26 @@ subtracted from the next goal that the policy is given: the *shift* of the goal.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from mjx_softarm.deploy.belief import Belief, pose_of
 from mjx_softarm.deploy.safety import Event, extrapolated, unsettled
-from mjx_softarm.deploy.way_error import WayError
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import asked_error, weighted_error
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.lag import ShapeLag, spring_lag_s
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.load import Load
+
+
+class Strategy(Protocol):
+    """Interface of a strategy: a value with a memory."""
+
+    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+        """Return the references for a goal (6,) [mm, deg], that ahead if it moves, and the next memory."""
+        ...
 
 
 class Choice(NamedTuple):
@@ -66,7 +71,7 @@ class AtRest(NamedTuple):
         shifts, allowed = [self.shift], None
         if belief.settled:
             pose, left = _left(self, belief, goal)
-            shifts = [_clipped(self.shift - share * left, config.shift_limit) for share in config.shares]
+            shifts = [clipped(self.shift - share * left, config.shift_limit) for share in config.shares]
             allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
         return self._act(belief, goal, shifts, events, allowed)
 
@@ -81,7 +86,7 @@ class AtRest(NamedTuple):
         """Take the first shift whose references leave a weighted error of at most `allowed`, if given."""
         events += extrapolated(belief)
         for shift in shifts:
-            reference_m = _planned(belief, belief.pose, goal + shift)
+            reference_m = planned(belief, belief.pose, goal + shift)
             if allowed is not None:
                 pose = _made(belief, reference_m, belief.load)
                 if weighted_error(pose, goal, belief.controller.policy.reward) > allowed:
@@ -109,82 +114,13 @@ class Timed(NamedTuple):
             return Choice(self, events=unsettled(belief), arrived=True)
         after = Timed(self.n_actions + 1)
         is_last = after.n_actions == policy.n_actions
-        reference_m = _last(belief, goal) if is_last else _planned(belief, belief.pose, goal)
+        reference_m = _last(belief, goal) if is_last else planned(belief, belief.pose, goal)
         return Choice(after, reference_m, extrapolated(belief))
 
 
-class Predicting(NamedTuple):
-    """Actions of a policy for arms at rest towards a moving goal: all of them in each tick.
-
-    The first one begins at the believed pose, each next one at the pose predicted for the last references.
-    The lengths at the goal are due half of `LoopConfig.rate_s` later. The references lead the lengths that
-    are due by the lag of the springs.
-    """
-
-    shift: np.ndarray = np.zeros(6)  # [mm, deg]
-    lengths_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
-    shape: ShapeLag = ShapeLag()  # memory of an arm with these lengths
-    behind: np.ndarray | float = 0.0  # (6,) [mm, deg] pose at rest with the last lengths less that in motion
-    way: WayError = WayError()
-
-    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
-        """Act several times; the last references count."""
-        # Lengths at the goal, of an arm whose shape lags and that has been beside its way
-        controller, policy, pose = belief.controller, belief.controller.policy, belief.pose
-        shift, length_m = self.shift, belief.spring_m
-        way = self.way.after(goal, pose - self.behind, controller)
-        goal = goal + self.behind + way.correction
-        for _ in range(policy.n_actions):
-            length_m = _planned(belief, pose, goal + shift)
-            pose, _ = pose_of(controller, length_m, belief.load)
-            left = asked_error(np.asarray(pose, float), goal, policy.reward)
-            shift = _clipped(shift - left, controller.config.shift_limit)
-        shape, behind = self.shape.after(policy, length_m, belief.load.believed_kg, controller.dt_s)
-
-        # Lengths due now, their rate, and the lag of springs that move so
-        n_ticks = 2 * max(1, round(0.5 * controller.config.rate_s / controller.dt_s))
-        lengths_m = (*self.lengths_m, length_m)[-n_ticks - 1 :]
-        rate = (lengths_m[-1] - lengths_m[0]) / (controller.dt_s * max(len(lengths_m) - 1, 1))
-        lag_s = spring_lag_s(policy, belief.command.pressure_kpa)
-        reference_m = lengths_m[(len(lengths_m) - 1) // 2] + lag_s @ rate
-        return Choice(Predicting(shift, lengths_m, shape, behind, way), reference_m)
-
-
-class Chasing(NamedTuple):
-    """Actions of a policy of motion towards a moving goal: one in each tick.
-
-    It observes as its last action that of `Policy.action_s` seconds ago, as in training. Circle in 20 s, four
-    policies of TQC and two of `motion-analytic`: 3.1 and 1.5 mm; with an action every 0.5 s 3.5 and 1.8 mm.
-    """
-
-    references_m: tuple[np.ndarray | None, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
-    shape: ShapeLag = ShapeLag()
-    way: WayError = WayError()
-
-    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
-        """Act from the pose in motion towards the goal, corrected by its error on the way."""
-        controller, policy = belief.controller, belief.controller.policy
-        load_kg = belief.load.believed_kg
-        shape, behind = self.shape.after(policy, belief.spring_m, load_kg, controller.dt_s)
-        pose = belief.pose - behind
-        way = self.way.after(goal, pose, controller)
-
-        # The last action that it observes, from those in force at the stop on
-        last_m = self.references_m or (belief.command.reference_m,)
-        observed = _observed(belief, last_m[0])
-        reference_m = controller.plan(pose, goal + way.correction, belief.spring_m, observed)
-        n_ticks = max(1, round(policy.action_s / controller.dt_s))
-        return Choice(Chasing((*last_m, reference_m)[-n_ticks:], shape, way), reference_m)
-
-
-Strategy = AtRest | Timed | Predicting | Chasing
-
-
-def strategy_of(policy: Policy, moves: bool) -> Strategy:
-    """Return the strategy for a new goal, fixed or moving."""
-    if policy.action_s:
-        return Chasing() if moves else Timed()
-    return Predicting() if moves else AtRest()
+def to_fixed_goal(policy: Policy) -> AtRest | Timed:
+    """Return the strategy for a new goal that stands."""
+    return Timed() if policy.action_s else AtRest()
 
 
 def _waits(belief: Belief, patience_s: float) -> bool:
@@ -194,12 +130,12 @@ def _waits(belief: Belief, patience_s: float) -> bool:
     return belief.command.n_ticks * belief.controller.dt_s < patience_s
 
 
-def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
+def planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the policy's references (n_springs,) [m] from a pose (6,) towards a target (6,) [mm, deg]."""
-    return belief.controller.plan(pose, target, belief.spring_m, _observed(belief))
+    return belief.controller.plan(pose, target, belief.spring_m, observed(belief))
 
 
-def _observed(belief: Belief, last_m: np.ndarray | None = None) -> np.ndarray | None:
+def observed(belief: Belief, last_m: np.ndarray | None = None) -> np.ndarray | None:
     """Return what the policy observes besides pose and goal; see `sensed`.
 
     `last_m` (n_springs,) [m] are the last references, by default those in force.
@@ -220,15 +156,15 @@ def _last(belief: Belief, goal: np.ndarray) -> np.ndarray:
     that would leave the least count.
     """
     controller, policy, config = belief.controller, belief.controller.policy, belief.controller.config
-    observed, shift, least, best_m = _observed(belief), np.zeros(6), np.inf, belief.spring_m
+    seen, shift, least, best_m = observed(belief), np.zeros(6), np.inf, belief.spring_m
     for _ in range(1 + config.n_corrections):
-        reference_m = controller.plan(belief.pose, goal + shift, belief.spring_m, observed)
+        reference_m = controller.plan(belief.pose, goal + shift, belief.spring_m, seen)
         pose = np.asarray(pose_of(controller, reference_m, belief.load)[0], float)
         error = float(weighted_error(pose, goal, policy.reward))
         if error < least:
             least, best_m = error, reference_m
         left = asked_error(pose, goal, policy.reward)
-        shift = _clipped(shift - config.correction_share * left, config.shift_limit)
+        shift = clipped(shift - config.correction_share * left, config.shift_limit)
     return best_m
 
 
@@ -254,5 +190,6 @@ def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     return np.asarray(pose_of(belief.controller, spring_m, load)[0], float)
 
 
-def _clipped(shift: np.ndarray, limit: np.ndarray) -> np.ndarray:
+def clipped(shift: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Return a shift (6,) of the goal within a limit (6,) [mm, deg]."""
     return np.clip(shift, -limit, limit)

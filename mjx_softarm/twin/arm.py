@@ -20,7 +20,6 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
-from mjx_softarm.pneumatics import Pneumatics
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.instruments import (
@@ -88,11 +87,8 @@ class Twin(InstrumentedArm):
         self.time_s = 0.0
         mujoco.mj_step1(self._model, self._data)
         self._start_losses(spec)
-        chambers, rest_m = self._parts.spec.chambers, spec.at_chambers(spec.geometry.section_length_m)
-        area, slope = np.array([*map(spec.per_chamber, (chambers.area_m2, chambers.area_slope_m))])
-        now_m, timestep_s = chamber_lengths(self._data, spec.n_chambers), self._model.opt.timestep
-        actuators = spec.actuators.per_chamber(spec.n_chambers)
-        self._air = Pneumatics(area, slope, rest_m, now_m, timestep_s, actuators)
+        now_m = chamber_lengths(self._data, spec.n_chambers)
+        self._air = self._parts.spec.pneumatics(now_m, self._model.opt.timestep)
         # Let the arm come to rest.
         self.attach(payload_kg)
         for _ in range(round(REST_S * spec.control.rate_hz)):

@@ -11,8 +11,8 @@ from mjx_softarm.deploy import link
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.ending import MISSED, Ending
-from mjx_softarm.deploy.goals import on_the_way
 from mjx_softarm.deploy.loop import start, step, with_goal
+from mjx_softarm.deploy.moving.way import on_the_way
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.logs.schema import write_log

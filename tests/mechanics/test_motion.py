@@ -27,7 +27,6 @@ from mjx_softarm.mechanics.motion.state import (
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.statics import all_tendons, chambers_and_springs
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.pneumatics import Pneumatics
 
 SPEC = ArmSpec.default()
 SHORT_ARM = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
@@ -70,9 +69,8 @@ def true_tips(spec, q, pressure_kpa, reference_m, step_s=TRUE_STEP_S, model=None
     data = mujoco.MjData(model)
     data.qpos[:] = q
     mujoco.mj_step1(model, data)
-    bellows = spec.chambers.area_m2, spec.chambers.area_slope_m, spec.geometry.section_length_m
     n = spec.n_chambers
-    air = Pneumatics(*bellows, chamber_lengths(data, n), step_s, spec.actuators.per_chamber(n))
+    air = spec.pneumatics(chamber_lengths(data, n), step_s)
     air.hold(pressure_kpa, chamber_lengths(data, n))
     law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data, n)), []
     for reference in reference_m:

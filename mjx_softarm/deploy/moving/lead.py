@@ -8,7 +8,6 @@ import numpy as np
 
 from mjx_softarm.control import LawState, pressures
 from mjx_softarm.mdp.observation import rate_ticks
-from mjx_softarm.pneumatics import Pneumatics
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import ShapeLag
 from mjx_softarm.policy.runtime import InMotion, sensed, tip_pose
@@ -57,10 +56,8 @@ def _tip_path(policy: Policy, plan: Plan, pressure_kpa: np.ndarray, goals: np.nd
     """
     # The arm at rest
     spec, dt_s = policy.spec, 1.0 / policy.rate_hz
-    chambers, straight_m = spec.chambers, spec.at_chambers(spec.geometry.section_length_m)
-    area, slope = np.array([*map(spec.per_chamber, (chambers.area_m2, chambers.area_slope_m))])
-    actuators = spec.actuators.per_chamber(spec.n_chambers)
-    air = Pneumatics(area, slope, straight_m, straight_m, dt_s, actuators)
+    straight_m = spec.at_chambers(spec.geometry.section_length_m)
+    air = spec.pneumatics(straight_m, dt_s)
     air.hold(pressure_kpa, straight_m)
     spring_m = _springs(policy, pressure_kpa)
     law = LawState.at_rest(pressure_kpa, spring_m)

@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.lead import tip_lag_s
+from mjx_softarm.deploy.moving.lead import tip_lag_s
 from mjx_softarm.mdp.observation import RATE_S, TIP_MM_PER_S
 from mjx_softarm.policy.lag import spring_lag_s
 from mjx_softarm.policy.runtime import tip_pose

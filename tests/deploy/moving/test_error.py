@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.way_error import WayError
+from mjx_softarm.deploy.moving.error import WayError
 from tests.linear_arm import DT_S, POLICY
 
 
