@@ -97,7 +97,8 @@ def build_robot(spec: ArmSpec) -> Any:
         for k, length_m in enumerate(spec.per_section(geometry.section_length_m))
     ]
     structure = PCSStructure(N_GAUSS_POINTS, list(BENDS_AND_STRETCHES) * n)
-    return PCS.from_links(links, structure=structure, gravity=np.array([9.81, 0.0, 0.0]))
+    gravity = np.array([0.0, 0.0, 9.81])  # the straight arm extends along z
+    return PCS.from_links(links, structure=structure, gravity=gravity)
 
 
 def stepper(robot: Any, method: str, step_s: float) -> Callable[[Any, Any], Any]:
