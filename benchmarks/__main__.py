@@ -40,6 +40,7 @@ BENCHMARKS = {
     "loads": "benchmarks.accuracy.loads:measure",
     "lost": "benchmarks.accuracy.lost:measure",
     "printed": "benchmarks.accuracy.printed:measure",
+    "matrix": "benchmarks.accuracy.matrix:measure",
     "paper": "benchmarks.paper.experiments:Paper",
     "confined": "benchmarks.accuracy.confined:measure",
     "traces": "benchmarks.paper.traces:measure",

@@ -1,7 +1,9 @@
-"""Arms of several kinds: recorded and calibrated from their own rod twins, trained, measured.
+"""Arms of several kinds: recorded and calibrated, trained, measured.
 
-The commands are those of `docs/your-arm.md`. Each arm is measured around a circle and at a grid of goals over
-its workspace. An arm is one job, whose results stay in its folder: the same command goes on where it ended.
+Each is a rod twin with seed 0, or one whose rod SoRoMoX moves. The commands are those of `docs/your-arm.md`.
+Each arm is measured around a circle, if asked with payloads that the loop is not given, and at a grid of
+goals over its workspace. An arm is one job, whose results stay in its folder: the same command goes on where
+it ended.
 """
 
 from __future__ import annotations
@@ -12,10 +14,11 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from benchmarks.harness.common import names_of, target
 from benchmarks.harness.parallel import in_parallel
+from benchmarks.harness.peers import peer_python
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import scaled
@@ -26,29 +29,52 @@ N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
 
 
-# Arms that ship, the turn of their bases, and the share of their masses. An arm that stands must do so
-# without pressure, before it is calibrated: the paper's arm, of 4.7 kg, falls over, a tenth of it stands.
+# An arm that stands must do so without pressure, before it is calibrated: the paper's arm, of 4.7 kg, falls
+# over, a tenth of it stands.
 HANGS, STANDS = (0.0, 0.0, 0.0), (180.0, 0.0, 0.0)
+
+
+class Kind(NamedTuple):
+    """An arm that ships, and the stand-in for it."""
+
+    name: str  # as for `--spec`
+    turn_deg: tuple[float, float, float] = HANGS  # of its base
+    mass_share: float = 1.0
+    driver: str = ""  # "": a rod twin
+    peer: str = ""  # library of `benchmarks.harness.peers` in whose environment the driver runs
+
+    def arm(self, file: Path, load_g: int = 0) -> str:
+        """Return the stand-in's name for `--arm`, with a payload; `file` has its specification."""
+        if self.driver:
+            return f"{self.driver}{load_g}g" if load_g else self.driver
+        return f"twin:rod:0@{file}" + (f":{load_g}g" if load_g else "")
+
+    @property
+    def python(self) -> Path | str:
+        """Interpreter for commands with the stand-in."""
+        return peer_python(self.peer) if self.peer else sys.executable
+
+
 ARMS = {
-    "paper": ("paper", HANGS, 1.0),
-    "sopra": ("sopra", HANGS, 1.0),
-    "stiff-flop": ("stiff-flop", HANGS, 1.0),
-    "four-chamber": ("four-chamber", HANGS, 1.0),
-    "upright": ("paper", STANDS, 0.1),
+    "paper": Kind("paper"),
+    "sopra": Kind("sopra"),
+    "stiff-flop": Kind("stiff-flop"),
+    "four-chamber": Kind("four-chamber"),
+    "upright": Kind("paper", STANDS, 0.1),
+    "soromox": Kind("paper", driver="benchmarks.accuracy.soromox_arm:Arm", peer="soromox"),
 }
 
 
 def measure(
-    arms: Annotated[tuple[str, ...], names_of(ARMS)] = tuple(ARMS),
+    arms: Annotated[tuple[str, ...], names_of(ARMS)] = tuple(name for name in ARMS if not ARMS[name].peer),
     poses: int = 300,
     preset: str = "analytic",
     steps: int | None = None,
     points: int = 40,
+    loads: cli.Integers = (),
     keep: cli.MaybePath = None,
 ) -> dict[str, Any]:
     """How well do arms of several kinds follow goals, from recording to measurement, by the same commands?
-
-    Each is recorded, calibrated, trained and measured on a rod twin with seed 0.
 
     Args:
         arms: names of arms
@@ -56,11 +82,12 @@ def measure(
         preset: of each training
         steps: environment steps of each training; None: the preset's
         points: goals of the circle, and of the grid at most
+        loads: payloads with which the circle is followed, too [g]
         keep: folder for logs, calibrations and runs, to go on with later; without one they are deleted
     """
     with tempfile.TemporaryDirectory() as folder:
         home = (keep or Path(folder)).absolute()
-        jobs = [(arm, _measure, (arm, home / arm, poses, preset, steps, points)) for arm in arms]
+        jobs = [(arm, _measure, (arm, home / arm, poses, preset, steps, points, loads)) for arm in arms]
         found = in_parallel(jobs)
     return {"targets": targets([found[arm] for arm in arms], arms), **{arm: found[arm] for arm in arms}}
 
@@ -82,25 +109,31 @@ def targets(figures: Sequence[dict[str, Any]], arms: Sequence[str]) -> list[dict
 
 
 def _measure(
-    arm: str, folder: Path, poses: int, preset: str, steps: int | None, points: int
+    arm: str,
+    folder: Path,
+    poses: int,
+    preset: str,
+    steps: int | None,
+    points: int,
+    loads: Sequence[int] = (),
 ) -> dict[str, Any]:
     """Take an arm through all commands; leave out those whose results are there."""
     # The arm, and its stand-in
     folder.mkdir(parents=True, exist_ok=True)
-    (name, turn_deg, share), file = ARMS[arm], folder / "arm.toml"
-    spec = ArmSpec.of(Path(name))
-    masses = {part: scaled(getattr(spec.mass, part), share) for part in ("arm_kg", "gripper_kg")}
-    spec = spec.replace(mass=masses, mounting={"base_turn_deg": turn_deg})
+    kind, file = ARMS[arm], folder / "arm.toml"
+    spec = ArmSpec.of(Path(kind.name))
+    masses = {part: scaled(getattr(spec.mass, part), kind.mass_share) for part in ("arm_kg", "gripper_kg")}
+    spec = spec.replace(mass=masses, mounting={"base_turn_deg": kind.turn_deg})
     spec.to_toml(file)
-    twin, calibration = f"twin:rod:0@{file}", folder / "calibration"
+    calibration = folder / "calibration"
     run, policy = folder / "run", folder / "run/policy.npz"
     logs = {folder / "poses.npz": (poses,), folder / "moving.npz": (N_MOVING, "--transients")}
 
     # Record, calibrate, train and export
-    record = ("mjx_softarm.deploy", "record", "--arm", twin, "--spec", file)
+    record = ("mjx_softarm.deploy", "record", "--arm", kind.arm(file), "--spec", file)
     for log, options in logs.items():
         if not log.exists():
-            run_command(*record, "--poses", *options, "--out", log, makes=log)
+            run_command(*record, "--poses", *options, "--out", log, makes=log, python=kind.python)
     if not calibration.exists():
         report = calibration / "report.json"
         run_command("calib", "run", *logs, "--spec", file, "--out", calibration, makes=report)
@@ -112,14 +145,19 @@ def _measure(
     if not policy.exists():
         run_command("train", "export", run, makes=policy)
 
-    # Measure the policy on the twin
+    # Measure the policy on its arm
     figures = {"length [mm]": 1e3 * spec.length_m, **_figures(folder)}
-    for goals in ("circle", "grid"):
-        out = folder / goals
+    measured = {"circle": ("circle", 0), "grid": ("grid", 0)}
+    measured |= {f"circle, {load_g} g": ("circle", load_g) for load_g in loads}
+    for title, (goals, load_g) in measured.items():
+        out = folder / title.replace(", ", "-").replace(" ", "")
         if not (out / "accuracy.json").exists():
-            accuracy_of(policy, twin, out, "--goals", goals, "--points", points)
+            options = "--goals", goals, "--points", points
+            accuracy_of(policy, kind.arm(file, load_g), out, *options, python=kind.python)
         accuracy = json.loads((out / "accuracy.json").read_text("utf-8"))
-        figures |= {f"{goals}, {what}": accuracy[key] for what, key in FIGURES.items()}
+        figures |= {f"{title}, {what}": accuracy[key] for what, key in FIGURES.items()}
+        if load_g:
+            figures[f"{title}, told [g]"] = accuracy["load_estimate_g"]
     return figures
 
 
@@ -147,29 +185,33 @@ def _figures(folder: Path) -> dict[str, Any]:
     }
 
 
-def accuracy_of(policy: Path, arm: str, out: Path, *options: Any) -> dict[str, Any]:
+def accuracy_of(
+    policy: Path, arm: str, out: Path, *options: Any, python: Path | str = sys.executable
+) -> dict[str, Any]:
     """Measure a policy on an arm by `deploy measure`; return the figures, which stay in the new folder `out`.
 
     Raises:
         InputError: the command failed, or arrived at no goal.
     """
     file = out / "accuracy.json"
-    run_command("mjx_softarm.deploy", "measure", policy, "--arm", arm, *options, "--out", out, makes=file)
+    asked = ("measure", policy, "--arm", arm, *options, "--out", out)
+    run_command("mjx_softarm.deploy", *asked, makes=file, python=python)
     return json.loads(file.read_text("utf-8"))
 
 
-def run_command(*words: Any, makes: Path) -> int:
+def run_command(*words: Any, makes: Path, python: Path | str = sys.executable) -> int:
     """Run a command of this project, its output shown; return its exit status, one of `DONE`.
 
     Args:
         words: of the command line, after `python -m`.
         makes: file that the command writes. A command that ends with an exception has status 1, too.
+        python: interpreter, whose environment may have other packages.
 
     Raises:
         InputError: the command ended with none of `DONE`, or without the file.
     """
     command = [str(word) for word in words]
-    status = subprocess.run([sys.executable, "-m", *command], check=False).returncode
+    status = subprocess.run([str(python), "-m", *command], check=False).returncode
     asked = f"python -m {' '.join(command)}"
     if status not in DONE:
         raise InputError(f"{asked}: got exit status {status}, expected {' or '.join(map(str, DONE))}")

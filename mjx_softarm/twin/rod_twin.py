@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -81,6 +82,8 @@ class RodTolerances:
 class RodTwin(InstrumentedArm):
     """One rod with regulators, sensors and cameras; an `ArmIO` with motion capture."""
 
+    rod_kind: Any = Rod  # a subclass may have another, with the same methods
+
     def __init__(
         self,
         seed: int,
@@ -106,7 +109,7 @@ class RodTwin(InstrumentedArm):
         super().__init__(_sensor(rng, self._spec, std), seed, session, build)
         parts = draw_rod(rng, seed, self._spec, std, self._base_rotation[2])
         parts = parts._replace(stiffness=(1.0 - build.softening) * parts.stiffness)
-        self._rod = Rod(parts, self._per_section)
+        self._rod = self.rod_kind(parts, self._per_section)
 
         # Chambers with air and regulators
         self._period_s, self.time_s = 1.0 / self._spec.control.rate_hz, 0.0

@@ -34,7 +34,7 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
     """Commands that only leave their results, the training interrupted once."""
     asked, accuracy = (
         [],
-        {"points": 4, "measured": 4, "max_mm": 5.0}
+        {"points": 4, "measured": 4, "max_mm": 5.0, "load_estimate_g": 480.0}
         | dict.fromkeys(
             ("reached", "translation_mm", "translation_95_mm", "rotation_deg", "saturated_points"), 2.0
         ),
@@ -43,7 +43,7 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
     figures["Sim-to-real network"] = {x: {"translation_mean_mm": 1.0} for x in ("test", "test_uncorrected")}
     report = {"trustworthy": True, "parts": {title: {"figures": of} for title, of in figures.items()}}
 
-    def leave(*words, makes):
+    def leave(*words, makes, python=sys.executable):
         asked.append(words[:2] if words[0] != "train" else words[:3])
         path = Path(words[-1])
         if words[1:3] == ("reach", "--resume"):
@@ -70,8 +70,19 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
         asked.clear()
         found = arms._measure("paper", tmp_path, 300, "analytic", None, 4)
         assert [words[1] for words in asked] == expected
+    with_load = arms._measure("paper", tmp_path, 300, "analytic", None, 4, (500,))
+    assert asked == [("mjx_softarm.deploy", "measure")] and with_load["circle, 500 g, told [g]"] == 480.0
     missed = found | {"circle, measured": 3}
     far = found | {"circle, mean [mm]": 3.01}
     rows = arms.targets([found, missed, far], ["a", "b", "c"])
     assert [row["verdict"] for row in rows] == ["met", "NOT MET", "NOT MET"]
     assert rows[1]["measured"] == "0.33% in the mean, 1 of 4 goals refused"
+
+
+def test_each_kind_names_its_stand_in(tmp_path, monkeypatch):
+    monkeypatch.setattr(arms, "peer_python", lambda name: tmp_path / name)
+    rod, soromox = arms.ARMS["sopra"], arms.ARMS["soromox"]
+    assert rod.arm(Path("arm.toml"), 500) == "twin:rod:0@arm.toml:500g" and rod.python == sys.executable
+    assert soromox.arm(Path("arm.toml")) == "benchmarks.accuracy.soromox_arm:Arm"
+    assert soromox.arm(Path("arm.toml"), 500) == "benchmarks.accuracy.soromox_arm:Arm500g"
+    assert soromox.python == tmp_path / "soromox"

@@ -1,0 +1,87 @@
+"""Every simulation against every other: which simulations a policy is tried in, and what is told of them."""
+
+import json
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from benchmarks.accuracy import matrix
+from benchmarks.accuracy.matrix import SIMULATIONS, in_simulations, means, on_arm, targets, trained_in
+from mjx_softarm import ArmSpec
+from mjx_softarm.env import EnvConfig, ReachEnv
+from train.agent.registry import World, learner_of
+from train.config import TrainConfig
+
+
+@pytest.mark.parametrize("name", SIMULATIONS)
+def test_a_run_is_named_after_its_simulation(name):
+    settings = SIMULATIONS[name] | {"simulation_step_s": 0.01}
+    assert trained_in(EnvConfig(**settings)) == name
+
+
+def test_an_untrained_policy_is_as_far_off_in_both_simulations_at_rest(monkeypatch):
+    two = dict(list(SIMULATIONS.items())[:2])
+    monkeypatch.setattr(matrix, "SIMULATIONS", two)
+    monkeypatch.setattr(matrix, "N_POSES", 8)
+    spec = ArmSpec.default().replace(structure={"links_per_section": 1})
+    config = TrainConfig()
+    learner = learner_of(config.learner, World(ReachEnv(spec, config.env), None, None))
+    state = learner.init(jax.random.PRNGKey(0))
+    run = SimpleNamespace(
+        config=config,
+        spec=spec,
+        arm=SimpleNamespace(s2r=None),
+        policy=lambda: learner.policy(state),
+    )
+    found = in_simulations(run, 2)
+    assert list(found) == list(two)
+    chain, mjx = found.values()
+    assert chain > 1.0 and chain == pytest.approx(mjx, abs=0.01)
+
+
+def test_a_policy_of_motion_is_not_tried_at_rest(monkeypatch):
+    monkeypatch.setattr(matrix, "SIMULATIONS", {"chain, at rest": SIMULATIONS["chain, at rest"]})
+    env = EnvConfig(mode="dynamic", observation="motion")
+    run = SimpleNamespace(config=SimpleNamespace(env=env), policy=lambda: None)
+    assert in_simulations(run, 2) == {"chain, at rest": None}
+
+
+@pytest.mark.parametrize(
+    "arm, kind, asked",
+    [
+        ("twin:1", "C MuJoCo twin", "twin:1"),
+        ("twin:rod:1", "rod", "twin:rod:1"),
+        ("soromox", "SoRoMoX", "benchmarks.accuracy.soromox_arm:Arm"),
+    ],
+)
+def test_each_arm_has_its_column(tmp_path, monkeypatch, arm, kind, asked):
+    def accuracy_of(policy, name, out, *options, python):
+        assert policy == tmp_path / "policy.npz" and name == asked
+        assert str(python).endswith("peer") == (arm == "soromox")
+        return {"translation_mm": 1.5}
+
+    monkeypatch.setattr(matrix, "accuracy_of", accuracy_of)
+    monkeypatch.setattr("benchmarks.accuracy.arms.peer_python", lambda name: "peer")
+    found = on_arm(SimpleNamespace(path=tmp_path), arm, 4)
+    assert found == dict.fromkeys(matrix.ARM_KINDS) | {kind: 1.5}
+
+
+def test_targets_compare_means_with_that_of_the_training():
+    rows = [
+        {"trained in": "chain, at rest", "arm": "a", "chain, at rest": 0.2, "MJX, at rest": 0.3, "rod": None},
+        {"trained in": "chain, at rest", "arm": "b", "chain, at rest": 0.4, "MJX, at rest": 0.3, "rod": 0.7},
+    ]
+    (mean,) = means(rows)
+    assert mean["runs"] == 2 and mean["chain, at rest"] == pytest.approx(0.3) and mean["rod"] == 0.7
+    assert [(row["measured"], row["verdict"]) for row in targets(rows)] == [
+        ("0.30 and 0.30 mm", "met"),
+        ("0.70 and 0.30 mm", "NOT MET"),
+    ]
+
+
+def test_soromox_s_worker_is_asked_for_distances(monkeypatch):
+    monkeypatch.setattr("benchmarks.accuracy.arms.peer_python", lambda name: "peer")
+    told = SimpleNamespace(stdout=json.dumps([0.5, 0.1]))
+    monkeypatch.setattr(matrix.subprocess, "run", lambda command, **rest: told)
+    assert matrix.beside_soromox() == {"poses": 2, "mean [mm]": 0.3, "largest [mm]": 0.5}
