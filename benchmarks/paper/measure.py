@@ -1,7 +1,9 @@
 """A trial on a twin and its outcome: errors by motion capture, saturation, contact forces, objects moved.
 
 An object is taken if the finger tips are near it when the loop reports an arrival: the twin then gets its
-weight. An object that is released near its container lies where the finger tips were; elsewhere it is lost.
+weight. Where it is to be placed, the padded floor of the container carries more of the weight the lower the
+object is, at the demonstrated place all of it. An object that is released near its container lies where the
+finger tips were; elsewhere it is lost.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion
 
 GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
 PLACE_M = 0.04  # finger tips to the middle of a container
+PADDING_N_PER_M = 9.81 * APPLE_KG / 0.01  # stiffness of a container's floor: an apple sinks in by 10 mm
 PACE_S = 1.0  # from a position to the next, where the arm does not stop
 CALM_N = 1.0  # contact force that counts as none
 # Masses in the containers when a task begins: the one picked first, then the one picked second.
@@ -78,7 +81,17 @@ class Gripper:
             _container(names[k]): (goals_m[k], kg) for k, kg in zip(picks, masses_kg, strict=False)
         }
         self._held_kg: float | None = None
+        self._places_m = np.array([goals_m[k] for k, name in enumerate(names) if name.startswith("place")])
         self.success = np.zeros(len(names), bool)
+
+    def driven(self) -> None:
+        """Let the floor of a container carry what it carries of the held object."""
+        if not self._held_kg or not len(self._places_m):
+            return
+        off_m = self.finger_m() - self._places_m
+        near = np.linalg.norm(off_m[:, :2], axis=1) <= PLACE_M
+        above_m = off_m[near, 2].min(initial=np.inf)
+        self._arm.attach(float(np.clip(PADDING_N_PER_M * above_m / 9.81, 0.0, self._held_kg)))
 
     def arrived(self, k: int) -> None:
         """Pick or place at goal k, if its name says so."""
@@ -133,8 +146,13 @@ def operate(
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces_n: list[float] = []
     force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
-    watched: Any = WatchedTwin(twin, lambda: forces_n.append(force()[0]))
-    gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
+    gripper = Gripper(twin, names, finger_tips(goals, gripper_m), objects, gripper_m)
+
+    def driven() -> None:
+        forces_n.append(force()[0])
+        gripper.driven()
+
+    watched: Any = WatchedTwin(twin, driven)
     # Run the loop, with or without stops.
     stopped = ~(moves & np.char.startswith(names, "to "))
     stopped[[0, -1]] = True

@@ -194,3 +194,30 @@ def test_full_gripper_picks_nothing_else():
     success, did = gripped({}, skip=(3,))  # the ball comes to the bottom, and ends where the apple should
     assert success == [False, True, False, False, False, True]
     assert did == [BALL_KG, "release"]
+
+
+@pytest.mark.parametrize(
+    "name, off_m, carried_kg",
+    [
+        ("place left", (0.0, 0.0, 0.0), 0.0),  # the floor carries the ball at the demonstrated place
+        ("place left", (0.0, 0.0, 0.001), 0.022),  # an apple sinks in by 10 mm, so 1 mm carries 22 g
+        ("place left", (0.0, 0.0, 0.05), BALL_KG),  # above the floor
+        ("place left", (0.0, 0.0, -0.01), 0.0),
+        ("place left", (1.1 * PLACE_M, 0.0, 0.0), BALL_KG),  # beside it
+        ("pick bottom", (0.0, 0.0, 0.0), BALL_KG),  # nothing is placed there
+    ],
+)
+def test_a_container_s_floor_carries_the_object_before_the_gripper_opens(name, off_m, carried_kg):
+    arm = Arm()
+    gripper = Gripper(arm, NAMES, GOALS_M, "as shown", GRIPPER_M)
+    arm.finger_m = GOALS_M[1]
+    gripper.driven()
+    assert not arm.did  # nothing is held
+    gripper.arrived(1)
+    arm.finger_m = GOALS_M[NAMES.index(name)] + off_m
+    gripper.driven()
+    assert arm.did == [BALL_KG, pytest.approx(carried_kg, abs=1e-9)]
+    gripper.arrived(3)
+    n = len(arm.did)
+    gripper.driven()
+    assert arm.did[n - 1] == "release" and len(arm.did) == n
