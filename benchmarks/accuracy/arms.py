@@ -1,9 +1,9 @@
 """Arms of several kinds: recorded and calibrated, trained, measured.
 
-Each is a rod twin with seed 0, or one whose rod SoRoMoX moves. The commands are those of `docs/your-arm.md`.
-Each arm is measured around a circle, if asked with payloads that the loop is not given, and at a grid of
-goals over its workspace. An arm is one job, whose results stay in its folder: the same command goes on where
-it ended.
+Each is a rod twin with seed 0, or one whose rod is SoRoMoX's. The commands are those of `docs/your-arm.md`.
+Each arm is measured around a circle and at a grid of goals over its workspace. With `--loads` it follows the
+circle with payloads, too, which the loop is not told. An arm is one job, whose results stay in its folder:
+the same command goes on where it ended.
 """
 
 from __future__ import annotations
@@ -43,11 +43,9 @@ class Kind(NamedTuple):
     driver: str = ""  # "": a rod twin
     peer: str = ""  # library of `benchmarks.harness.peers` in whose environment the driver runs
 
-    def arm(self, file: Path, load_g: int = 0) -> str:
-        """Return the stand-in's name for `--arm`, with a payload; `file` has its specification."""
-        if self.driver:
-            return f"{self.driver}{load_g}g" if load_g else self.driver
-        return f"twin:rod:0@{file}" + (f":{load_g}g" if load_g else "")
+    def arm(self, file: Path) -> str:
+        """Return the stand-in's name for `--arm`; `file` has its specification."""
+        return self.driver or f"twin:rod:0@{file}"
 
     @property
     def python(self) -> Path | str:
@@ -77,7 +75,7 @@ def measure(
     """How well do arms of several kinds follow goals, from recording to measurement, by the same commands?
 
     Args:
-        arms: names of arms
+        arms: names of arms; all but soromox, which needs SoRoMoX's environment, unless given
         poses: random poses of each calibration
         preset: of each training
         steps: environment steps of each training; None: the preset's
@@ -152,8 +150,8 @@ def _measure(
     for title, (goals, load_g) in measured.items():
         out = folder / title.replace(", ", "-").replace(" ", "")
         if not (out / "accuracy.json").exists():
-            options = "--goals", goals, "--points", points
-            accuracy_of(policy, kind.arm(file, load_g), out, *options, python=kind.python)
+            options = "--goals", goals, "--points", points, *(("--payload", load_g) if load_g else ())
+            accuracy_of(policy, kind.arm(file), out, *options, python=kind.python)
         accuracy = json.loads((out / "accuracy.json").read_text("utf-8"))
         figures |= {f"{title}, {what}": accuracy[key] for what, key in FIGURES.items()}
         if load_g:

@@ -1,15 +1,14 @@
 """Every simulation against every other: policies on the circle, in simulations that they did not learn in.
 
 The first columns are simulations of the arm that a policy learned with, without the control loop: it goes to
-each goal from a random pose of the workspace, and the tip is looked at after the last action. The other
-columns are arms that no policy has seen, with the loop: that to which it is calibrated, of one of three
-kinds. A policy of motion cannot be used at rest, where there are no rates to observe.
+each goal from a random pose of the workspace, and the tip is looked at after the last action. The last three
+columns are the arm that the policy is calibrated to, driven by the loop: a twin in C MuJoCo, a rod, or
+SoRoMoX's rod. A policy of motion cannot be used at rest, where there are no rates to observe.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import subprocess
 import sys
@@ -23,7 +22,9 @@ import numpy as np
 
 from benchmarks.accuracy.arms import ARMS, accuracy_of
 from benchmarks.harness.common import arms_and_files, grouped, target
+from benchmarks.paper.kinds import POLICY_FILE
 from mjx_softarm._support import xla
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mechanics.excitation import circle_poses
 from train.agent.registry import World, learner_of
@@ -37,11 +38,11 @@ SIMULATIONS: dict[str, dict[str, Any]] = {
     "chain, in motion": {"mode": "dynamic", "engine": "chain", "simulation_step_s": 0.02},
     "mjx.step, in motion": {"mode": "dynamic", "engine": "mjx", "simulation_step_s": 0.002},
 }
-# In motion, a policy trained at rest acts on an arm that has nearly come to rest, as in the loop
-ACTIONS = {"pose": (4, 4.0), "payload": (4, 4.0), "motion": (12, 0.5)}  # number, and duration [s] in motion
+N_AT_REST, N_IN_MOTION = 4, 12  # actions of policies that were trained so, in all simulations
+REST_S = 4.0  # duration of an action of policies trained at rest, in motion: the arm has nearly come to rest
 ARM_KINDS = "C MuJoCo twin", "rod", "SoRoMoX"
 SOROMOX = "soromox"  # arm of `benchmarks arms`
-TWICE = 2.0  # target: error in any simulation, over that in the simulation of the training
+TWICE = 2.0  # target: error in any simulation and on any arm, over that in the simulation of the training
 N_POSES = 256  # of the pool of starts
 BESIDE = 0, 20  # seed of the rod, and number of random pressures, for `beside_soromox`
 
@@ -55,44 +56,59 @@ def measure(runs: tuple[str, ...], points: int = 8) -> dict[str, Any]:
         points: of the circle
 
     Raises:
-        InputError: there are no runs, or a goal on an arm was not measured.
-        RunError: a folder holds no finished run.
+        InputError: there are no runs, one is not exported, or a goal on an arm was not measured.
+        RunError: a folder holds no run.
         PeerError: SoRoMoX could not be installed.
     """
     xla.enable_compilation_cache()
-    rows = []
-    for arm, folder in arms_and_files(runs):
-        run = Run.open(Path(folder))
-        row = {"trained in": trained_in(run.config.env), "arm": arm, **in_simulations(run, points)}
-        rows.append(row | on_arm(run, arm, points))
+    # What may fail comes first
+    chosen = [(arm, opened(Path(folder))) for arm, folder in arms_and_files(runs, "--runs", "RUN")]
+    heads = [{"trained in": trained_in(run.config.env), "arm": arm} for arm, run in chosen]
+    for arm, _ in chosen:
+        kind_of(arm)
+    beside, rows = beside_soromox(), []
+    for head, (arm, run) in zip(heads, chosen, strict=True):
+        rows.append({**head, **in_simulations(run, points), **on_arm(run, arm, points)})
         print(rows[-1], flush=True)
-    return {
-        "points": points,
-        "means": means(rows),
-        "targets": targets(rows),
-        "rod beside SoRoMoX": beside_soromox(),
-        "runs": rows,
-    }
+    found = {"points": points, "means": means(rows), "targets": targets(rows)}
+    return found | {"rod beside SoRoMoX": beside, "runs": rows}
+
+
+def opened(folder: Path) -> Run:
+    """Open a run.
+
+    Raises:
+        InputError: it is not exported.
+        RunError: the folder holds no run.
+    """
+    run = Run.open(folder)
+    if not (folder / POLICY_FILE).exists():
+        raise InputError(f"--runs: {folder}: got no {POLICY_FILE}, expected an exported run")
+    return run
 
 
 def trained_in(config: EnvConfig) -> str:
-    """Return the name of a run's simulation, a key of `SIMULATIONS`.
+    """Return the name of a run's simulation, a key of `SIMULATIONS`; its time step may differ.
 
-    Its time step may differ.
+    Raises:
+        InputError: there is none, as for MJX-Warp.
     """
-    alike = ((config.mode, config.engine) == (own["mode"], own["engine"]) for own in SIMULATIONS.values())
-    return next(itertools.compress(SIMULATIONS, alike))
+    for name, own in SIMULATIONS.items():
+        if (config.mode, config.engine) == (own["mode"], own["engine"]):
+            return name
+    raise InputError(f"--runs: got the engine {config.engine}, expected chain or mjx")
 
 
 def in_simulations(run: Run, points: int) -> dict[str, float | None]:
     """Return the mean error [mm] on the circle in each simulation; None for one that a policy cannot see."""
-    policy, found = run.policy(), dict[str, float | None]()
-    n_actions, duration_s = ACTIONS[run.config.env.observation]
+    own, policy, found = run.config.env, run.policy(), dict[str, float | None]()
+    n_actions = N_IN_MOTION if own.moves else N_AT_REST
+    duration_s = own.dynamic_step_s if own.moves else REST_S
     for name, settings in SIMULATIONS.items():
-        if run.config.env.observation == "motion" and settings["mode"] == "quasistatic":
+        if own.observation == "motion" and settings["mode"] == "quasistatic":
             found[name] = None
             continue
-        config = dataclasses.replace(run.config.env, n_poses=N_POSES, dynamic_step_s=duration_s, **settings)
+        config = dataclasses.replace(own, n_poses=N_POSES, dynamic_step_s=duration_s, **settings)
         env = nominal(ReachEnv(run.spec, config, run.arm.s2r))
         learner = learner_of(run.config.learner, World(env, None, None))
         follow = xla.jit(jax.vmap(follower(env, learner, n_actions), in_axes=(None, 0, 0)))
@@ -102,15 +118,32 @@ def in_simulations(run: Run, points: int) -> dict[str, float | None]:
     return found
 
 
+def kind_of(arm: str) -> str:
+    """Return the kind of an arm, one of `ARM_KINDS`.
+
+    Raises:
+        InputError: it is of none.
+    """
+    twin, rod, soromox = ARM_KINDS
+    for beginning, kind in (("twin:rod:", rod), ("twin:", twin), (SOROMOX, soromox)):
+        if arm.startswith(beginning):
+            return kind
+    raise InputError(f"--runs: got the arm {arm}, expected twin:SEED, twin:rod:SEED or {SOROMOX}")
+
+
 def on_arm(run: Run, arm: str, points: int) -> dict[str, float | None]:
-    """Return the mean error [mm] on the circle of the exported policy, for the kind of its arm."""
-    soromox = ARMS[SOROMOX]
-    kind = ARM_KINDS[2 if arm == SOROMOX else 1 if ":rod:" in arm else 0]
+    """Return the mean error [mm] on the circle of the exported policy, for the kind of its arm.
+
+    Raises:
+        InputError: a goal was not measured.
+    """
+    kind, soromox = kind_of(arm), ARMS[SOROMOX]
     name, python = (soromox.driver, soromox.python) if arm == SOROMOX else (arm, sys.executable)
     with tempfile.TemporaryDirectory() as folder:
-        told = accuracy_of(
-            run.path / "policy.npz", name, Path(folder, "circle"), "--points", points, python=python
-        )
+        out, asked = Path(folder, "circle"), ("--points", points)
+        told = accuracy_of(run.path / POLICY_FILE, name, out, *asked, python=python)
+    if told["measured"] < points:
+        raise InputError(f"--runs: {arm}={run.path}: got {told['measured']} of {points} goals, expected all")
     return dict.fromkeys(ARM_KINDS) | {kind: told["translation_mm"]}
 
 
@@ -119,7 +152,7 @@ def beside_soromox() -> dict[str, float]:
     asked = "benchmarks.accuracy.soromox_arm", *map(str, BESIDE)
     command = [str(ARMS[SOROMOX].python), "-m", *asked]
     told = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    apart_mm = json.loads(told.stdout)
+    apart_mm = json.loads(told.stdout)["apart_mm"]
     return {"poses": len(apart_mm), "mean [mm]": float(np.mean(apart_mm)), "largest [mm]": max(apart_mm)}
 
 
@@ -135,13 +168,17 @@ def means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Return the target of each simulation, beside the one that policies learned in."""
+    """Return the target of each simulation and kind of arm, beside the simulation of the training.
+
+    Both means are over the runs that have both figures.
+    """
     found = []
-    for mean in means(rows):
-        own = mean[mean["trained in"]]
-        for name, value in mean.items():
-            if name in ("trained in", "runs", mean["trained in"]) or value is None:
+    for (trained,), group in grouped(rows, ("trained in",)).items():
+        for name in [*SIMULATIONS, *ARM_KINDS]:
+            both = np.array([(row[name], row[trained]) for row in group if row.get(name) is not None])
+            if name == trained or not len(both):
                 continue
-            text = f"{mean['trained in']}: in {name} at most {TWICE:g} times as far off"
-            found.append(target(text, f"{value:.2f} and {own:.2f} mm", value <= TWICE * own))
+            value, own = both.mean(axis=0)
+            text = f"{trained}: in {name} at most {TWICE:g} times as far off"
+            found.append(target(text, f"{value:.2f} and {own:.2f} mm", bool(value <= TWICE * own)))
     return found

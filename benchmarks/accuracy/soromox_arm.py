@@ -1,11 +1,12 @@
-"""An arm that SoRoMoX simulates, with the parts of a rod twin: drivers `Arm`, `Arm500g` and `Arm1000g`.
+"""An arm whose rod is a robot of SoRoMoX: the driver `Arm`.
 
-Kinematics, inertia, gravity and the backbone's elasticity are SoRoMoX's, of a robot with piecewise constant
-strains: torsion, bending, stretch and shear. Chambers and springs are fibres along it, with the energies of
-`mjx_softarm.twin.rod`; gripper and payload are masses below its end. Readings, regulators and the drawn parts
-are those of `twin:rod:0`. It runs in SoRoMoX's own environment, see `benchmarks.harness.peers`.
+Kinematics, inertia, gravity and the backbone's elasticity are SoRoMoX's, of piecewise constant strains:
+torsion, bending, stretch and shear. Chambers and springs are fibres along it, with the energies of
+`mjx_softarm.twin.rod`; gripper and payload are masses below its end. The time step is linearly implicit
+Euler, one a control period, with the damping of that rod. Readings, regulators and the drawn parts are those
+of `twin:rod:0`. It runs in SoRoMoX's own environment, see `benchmarks.harness.peers`.
 
-    PYTHON -m mjx_softarm.deploy measure POLICY --arm benchmarks.accuracy.soromox_arm:Arm
+    PYTHON -m mjx_softarm.deploy measure POLICY --arm benchmarks.accuracy.soromox_arm:Arm --out FOLDER
     PYTHON -m benchmarks.accuracy.soromox_arm SEED N    tips beside those of a rod twin, at N random pressures
 
 Source: SoRoMoX, https://github.com/tud-phi/soromox.
@@ -46,7 +47,7 @@ _AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 
 
 class SoromoxRod:
-    """A rod with the interface of `mjx_softarm.twin.rod.Rod`, moved by SoRoMoX, with inertia."""
+    """A rod with the interface of `mjx_softarm.twin.rod.Rod`, with SoRoMoX's mechanics and inertia."""
 
     def __init__(self, parts: RodParts, per_section: int):
         """Make a straight rod without force, with `per_section` segments in each section."""
@@ -63,7 +64,7 @@ class SoromoxRod:
 
         # Energy of all parts
         def stretch(q: Array) -> Array:
-            """Return lengths (s, per_section, c + k) of the fibres, relative to their segment's."""
+            """Return lengths (s, per_section, c + k) of the fibres, divided by that of their segment."""
             rotation, way = jnp.split(robot.strain(q).reshape(n_sections, per_section, 1, 6), 2, axis=-1)
             return jnp.linalg.norm(way + jnp.cross(rotation, hole_m[:, None]), axis=-1)
 
@@ -72,24 +73,31 @@ class SoromoxRod:
             end = robot.forward_kinematics(q, self._end_m[-1])
             return end[:3, 3] + parts.tool_offset_m[:, None] * end[:3, 0]
 
+        def elastic(q: Array, pressure_kpa: Array, parts: RodParts) -> Array:
+            fibres = fibre_energy(stretch(q), pressure_kpa, parts).sum() / per_section
+            return 0.5 * q @ robot.stiffness_matrix() @ q + fibres
+
         def energy(q: Array, pressure_kpa: Array, parts: RodParts) -> Array:
             height_m = tools(q, parts) @ (_AXES.T @ parts.up)
             weight = robot.gravitational_energy(q) + GRAVITY_M_S2 * parts.tool_mass_kg @ height_m
-            fibres = fibre_energy(stretch(q), pressure_kpa, parts).sum() / per_section
-            return 0.5 * q @ robot.stiffness_matrix() @ q + weight + fibres
+            return elastic(q, pressure_kpa, parts) + weight
 
         # A linearly implicit Euler step; damping in proportion to the straight rod's stiffness
         gradient = jax.grad(energy)
         straight = jnp.zeros(robot.num_coordinates)
         no_kpa = jnp.zeros((n_sections, n_chambers))
-        damping = CREEP_S * jnp.diag(jnp.diag(jax.jacfwd(gradient)(straight, no_kpa, parts)))
+        self.damping = CREEP_S * jnp.diag(jax.hessian(elastic)(straight, no_kpa, parts))  # of each strain
+        damping = jnp.diag(self.damping)
 
         def advance(q: Array, v: Array, pressure_kpa: Array, parts: RodParts, step_s: float) -> Any:
             """Return strains, rates, and the largest force before the step."""
             force, slope = (f(q, pressure_kpa, parts) for f in (gradient, jax.jacfwd(gradient)))
             inertia, bias, _ = robot.dynamics_terms(q, v)
-            arms = jax.jacfwd(tools)(q, parts)  # (2, 3, n)
-            inertia += jnp.einsum("tki,tkj,t->ij", arms, arms, parts.tool_mass_kg)
+            # Gripper and payload: inertia, and the force of their acceleration at constant rates
+            arms, kg = jax.jacfwd(tools)(q, parts), parts.tool_mass_kg  # (2, 3, n)
+            turned = jax.jvp(lambda x: jax.jvp(lambda y: tools(y, parts), (x,), (v,))[1], (q,), (v,))[1]
+            inertia += jnp.einsum("tki,tkj,t->ij", arms, arms, kg)
+            bias += jnp.einsum("tki,tk,t->i", arms, turned, kg)
             matrix = inertia + step_s * damping + step_s**2 * slope
             pull = -force - bias - damping @ v - step_s * slope @ v
             v = v + jnp.linalg.solve(matrix, step_s * pull)
@@ -106,7 +114,7 @@ class SoromoxRod:
         """Return the rod's cross-sections."""
         frame = np.asarray(self._robot.forward_kinematics_abscissa_batched(self._q, self._end_m))
         roll = np.repeat(self._roll, self.per_section, axis=0)
-        rotation = _AXES @ frame[:, :3, :3] @ _AXES.T @ np.concatenate([roll[:1], roll])
+        rotation = _AXES @ frame[:, :3, :3] @ _AXES.T @ np.concatenate([np.eye(3)[None], roll])
         return Shape(frame[:, :3, 3] @ _AXES.T, rotation)
 
     def chamber_lengths(self) -> np.ndarray:
@@ -149,7 +157,7 @@ def fibre_energy(stretch: Array, pressure_kpa: Array, parts: RodParts) -> Array:
     Its derivatives by the lengths are the pulls of `mjx_softarm.twin.rod`.
 
     Args:
-        stretch (s, per_section, c + k): lengths, relative to the segment's.
+        stretch (s, per_section, c + k): lengths, divided by that of the segment.
         pressure_kpa (s, c) [kPa]: pressures.
         parts: numbers of the rod.
     """
@@ -203,38 +211,29 @@ class SoromoxTwin(RodTwin):
 class Arm(SoromoxTwin):
     """The paper's arm, a driver for `--arm`."""
 
-    payload_kg = 0.0
-
     def __init__(self) -> None:
-        super().__init__(0, payload_kg=self.payload_kg, build=AS_BUILT._replace(per_section=PER_SECTION))
+        super().__init__(0, build=AS_BUILT._replace(per_section=PER_SECTION))
 
 
-class Arm500g(Arm):
-    """The same arm with 500 g."""
+def beside_rod(seed: int, n: int) -> dict[str, Any]:
+    """Compare with the rod of `twin:rod:SEED`, both with six pieces a section and without noise.
 
-    payload_kg = 0.5
-
-
-class Arm1000g(Arm):
-    """The same arm with 1 kg."""
-
-    payload_kg = 1.0
-
-
-def distances_mm(seed: int, n: int) -> list[float]:
-    """Return how far the tips of SoRoMoX's rod and of `twin:rod:SEED` are apart, at n random pressures.
-
-    Both have as many pieces as the twin.
+    Returns:
+        `apart_mm`: distances of the tips at n random pressures; `damping_ratio`: least and greatest ratio of
+        the strains' dampings.
     """
     arms = [kind(seed, build=AS_BUILT._replace(noise=0.0)) for kind in (SoromoxTwin, RodTwin)]
-    found = []
+    apart_mm = []
     for pressure_kpa in random_pressures(ArmSpec.default(), n, seed):
         for arm in arms:
             arm.settle(pressure_kpa)
         one, other = (arm.motion_capture().tip_m for arm in arms)
-        found.append(1e3 * float(np.linalg.norm(one - other)))
-    return found
+        apart_mm.append(1e3 * float(np.linalg.norm(one - other)))
+    # Strains of a rod: bending x and y, torsion, shear x and y, stretch
+    own, rods = (np.reshape(arm._rod.damping, (-1, 6)) for arm in arms)
+    ratio = own[:, [2, 1, 0, 4, 5, 3]] / rods
+    return {"apart_mm": apart_mm, "damping_ratio": [float(ratio.min()), float(ratio.max())]}
 
 
 if __name__ == "__main__":
-    print(json.dumps(distances_mm(*map(int, sys.argv[1:]))))
+    print(json.dumps(beside_rod(*map(int, sys.argv[1:]))))

@@ -60,20 +60,22 @@ def three_of(text: str, option: str, form: str) -> tuple[str, str, str]:
     return parts[0], parts[1], parts[2]
 
 
-def arms_and_files(policies: Sequence[str]) -> list[tuple[str, str]]:
-    """Return arm and file of each text ARM=FILE of the option `--policies`.
+def arms_and_files(
+    texts: Sequence[str], option: str = "--policies", file: str = "FILE"
+) -> list[tuple[str, str]]:
+    """Return arm and file of each text ARM=FILE of an option.
 
     Raises:
         InputError: there are none, or one has another form.
     """
-    if not policies:
-        raise InputError("--policies: got none, expected ARM=FILE of each policy")
+    if not texts:
+        raise InputError(f"{option}: got none, expected ARM={file} of each")
     found = []
-    for text in policies:
-        arm, separator, file = text.partition("=")
+    for text in texts:
+        arm, separator, path = text.partition("=")
         if not separator:
-            raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
-        found.append((arm, file))
+            raise InputError(f"{option}: got {text}, expected ARM={file}, such as twin:0=runs/mine")
+        found.append((arm, path))
     return found
 
 

@@ -1,9 +1,9 @@
 """A trial on a twin and its outcome: errors by motion capture, saturation, contact forces, objects moved.
 
 An object is taken if the finger tips are near it when the loop reports an arrival: the twin then gets its
-weight. Where it is to be placed, the padded floor of the container carries more of the weight the lower the
-object is, at the demonstrated place all of it. An object that is released near its container lies where the
-finger tips were; elsewhere it is lost.
+weight. The padded floor of a container carries more of it the lower the object is, and all where the object
+is picked or placed. An object that is released near its container lies where the finger tips were; elsewhere
+it is lost.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from mjx_softarm.deploy.ending import LoopRun
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
+from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion
 
 GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
 PLACE_M = 0.04  # finger tips to the middle of a container
-PADDING_N_PER_M = 9.81 * APPLE_KG / 0.01  # stiffness of a container's floor: an apple sinks in by 10 mm
+PADDING_N_PER_M = GRAVITY_M_S2 * APPLE_KG / 0.01  # of a container's floor, into which an apple sinks 10 mm
 PACE_S = 1.0  # from a position to the next, where the arm does not stop
 CALM_N = 1.0  # contact force that counts as none
 # Masses in the containers when a task begins: the one picked first, then the one picked second.
@@ -81,17 +82,23 @@ class Gripper:
             _container(names[k]): (goals_m[k], kg) for k, kg in zip(picks, masses_kg, strict=False)
         }
         self._held_kg: float | None = None
-        self._places_m = np.array([goals_m[k] for k, name in enumerate(names) if name.startswith("place")])
+        self._hung_kg = 0.0  # part of it that no floor carries
+        self._floors_m = np.array(
+            [goals_m[k] for k, name in enumerate(names) if name.startswith(("pick", "place"))]
+        )
         self.success = np.zeros(len(names), bool)
 
     def driven(self) -> None:
-        """Let the floor of a container carry what it carries of the held object."""
-        if not self._held_kg or not len(self._places_m):
+        """Hang that part of the held object's weight to the arm that no container's floor carries."""
+        if self._held_kg is None:
             return
-        off_m = self.finger_m() - self._places_m
+        off_m = self.finger_m() - self._floors_m
         near = np.linalg.norm(off_m[:, :2], axis=1) <= PLACE_M
         above_m = off_m[near, 2].min(initial=np.inf)
-        self._arm.attach(float(np.clip(PADDING_N_PER_M * above_m / 9.81, 0.0, self._held_kg)))
+        hung_kg = float(np.clip(PADDING_N_PER_M * above_m / GRAVITY_M_S2, 0.0, self._held_kg))
+        if hung_kg != self._hung_kg:
+            self._hung_kg = hung_kg
+            self._arm.attach(hung_kg)
 
     def arrived(self, k: int) -> None:
         """Pick or place at goal k, if its name says so."""
@@ -101,18 +108,18 @@ class Gripper:
             if np.linalg.norm(self.finger_m() - object_m) <= GRASP_M:
                 del self._lying[container]
                 self._held_kg, self.success[k] = kg, True
-                self._arm.attach(kg)
+                self.driven()
         elif operation == "place" and self._held_kg is not None:
             finger_m = self.finger_m()
             if np.linalg.norm(finger_m - self._goals_m[k]) <= PLACE_M:
                 self._lying[container], self.success[k] = (finger_m, self._held_kg), True
-            self._held_kg = None
+            self._held_kg, self._hung_kg = None, 0.0
             self._arm.release()
 
     def finger_m(self) -> np.ndarray:
-        """Return the finger tips (3,) [m] by motion capture."""
-        seen = self._arm.motion_capture()
-        return captured_finger_tips(seen.tip_m, seen.tip_quaternion, self._gripper_m)
+        """Return the true place of the finger tips (3,) [m]."""
+        tip_m, rotation = self._arm.tip()
+        return tip_m - self._gripper_m * rotation[:, 2]
 
 
 def _container(name: str) -> str:

@@ -140,6 +140,14 @@ class Twin(InstrumentedArm):
     def _true_kpa(self) -> np.ndarray:
         return self._air.pressure_kpa
 
+    def tip(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the true place (3,) [m] and rotation (3, 3) of the tip, in motion capture's frame."""
+        site = self._data.site("tip")
+        return (
+            self._base_m + self._base_rotation @ site.xpos,
+            self._base_rotation @ site.xmat.reshape(3, 3),
+        )
+
     def motion_capture(self) -> Capture:
         """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
         spec, data = self._parts.spec, self._data
@@ -148,8 +156,7 @@ class Twin(InstrumentedArm):
         bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
         down = 0.5 * spec.link_length_m[bodies - 1, None] * data.xmat[bodies, 2::3]
         marker_m = self._base_m + (data.xpos[bodies] - down) @ self._base_rotation.T
-        tip = self._base_rotation @ data.site("tip").xmat.reshape(3, 3)
-        tip_m = self._base_m + self._base_rotation @ data.site("tip").xpos
+        tip_m, tip = self.tip()
 
         def turned(vector_rad: np.ndarray) -> np.ndarray:
             quaternion = np.zeros(4)

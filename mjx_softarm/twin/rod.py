@@ -97,7 +97,7 @@ class Rod:
         self.replace(parts)
         self.q = np.tile(REST_STRAIN, (n_sections * per_section, 1))
         stiffness = self._local(self.q, np.zeros((n_sections, n_chambers)))[1]
-        self._damping = CREEP_S * np.diagonal(stiffness, axis1=1, axis2=2).ravel()
+        self.damping = CREEP_S * np.diagonal(stiffness, axis1=1, axis2=2).ravel()
 
     def replace(self, parts: RodParts) -> None:
         """Change masses, areas or stiffnesses of the parts; the strains stay."""
@@ -138,7 +138,7 @@ class Rod:
         gradient, hessian = self._derivatives(pressure_kpa.reshape(self.parts.stiffness.shape))
         factor = None
         while factor is None:
-            np.fill_diagonal(hessian, hessian.diagonal() + self._damping / duration_s)
+            np.fill_diagonal(hessian, hessian.diagonal() + self.damping / duration_s)
             try:
                 factor = cho_factor(hessian, check_finite=False)
             except LinAlgError:  # the potential is not convex here: take a shorter step

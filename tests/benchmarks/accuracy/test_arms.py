@@ -32,7 +32,8 @@ def test_a_command_that_ends_with_a_traceback_ends_the_benchmark(tmp_path):
 
 def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_path, monkeypatch):
     """Commands that only leave their results, the training interrupted once."""
-    asked, accuracy = (
+    asked, told, accuracy = (
+        [],
         [],
         {"points": 4, "measured": 4, "max_mm": 5.0, "load_estimate_g": 480.0}
         | dict.fromkeys(
@@ -45,6 +46,7 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
 
     def leave(*words, makes, python=sys.executable):
         asked.append(words[:2] if words[0] != "train" else words[:3])
+        told.append((python, *map(str, words)))
         path = Path(words[-1])
         if words[1:3] == ("reach", "--resume"):
             (path / "evaluation.json").write_text("{}")
@@ -72,6 +74,9 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
         assert [words[1] for words in asked] == expected
     with_load = arms._measure("paper", tmp_path, 300, "analytic", None, 4, (500,))
     assert asked == [("mjx_softarm.deploy", "measure")] and with_load["circle, 500 g, told [g]"] == 480.0
+    python, *words = told[-1]
+    assert python == sys.executable and words[words.index("--payload") + 1] == "500"
+    assert words[words.index("--arm") + 1] == f"twin:rod:0@{tmp_path / 'arm.toml'}"
     missed = found | {"circle, measured": 3}
     far = found | {"circle, mean [mm]": 3.01}
     rows = arms.targets([found, missed, far], ["a", "b", "c"])
@@ -82,7 +87,6 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
 def test_each_kind_names_its_stand_in(tmp_path, monkeypatch):
     monkeypatch.setattr(arms, "peer_python", lambda name: tmp_path / name)
     rod, soromox = arms.ARMS["sopra"], arms.ARMS["soromox"]
-    assert rod.arm(Path("arm.toml"), 500) == "twin:rod:0@arm.toml:500g" and rod.python == sys.executable
+    assert rod.arm(Path("arm.toml")) == "twin:rod:0@arm.toml" and rod.python == sys.executable
     assert soromox.arm(Path("arm.toml")) == "benchmarks.accuracy.soromox_arm:Arm"
-    assert soromox.arm(Path("arm.toml"), 500) == "benchmarks.accuracy.soromox_arm:Arm500g"
     assert soromox.python == tmp_path / "soromox"
