@@ -34,3 +34,10 @@ def test_a_training_has_the_walls_of_its_pipe(tmp_path, monkeypatch, case):
     assert (config.env.clearance_cost_per_mm > 0) == ("clearance" in case)
     taken = tmp_path / "lips-learned-twin1-seed2" if "narrow" in case else None
     assert options.reward == taken and config.learner.total_env_steps == 8192
+
+
+def test_a_case_that_was_not_run_misses_no_target():
+    row = {"case": "lips-learned", "objects": "as shown", "done": 4, "wall_max_n": 4.9}
+    learned, narrow = confined.targets([row, row | {"wall_max_n": 5.1}])
+    assert (learned["measured"], learned["verdict"]) == ("1 of 2", "NOT MET")
+    assert (narrow["measured"], narrow["verdict"]) == ("not run", "skipped")
