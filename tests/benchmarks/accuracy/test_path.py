@@ -14,7 +14,9 @@ from mjx_softarm.policy.file import SHIPPED, load_policy
 
 def test_a_policy_is_measured_in_time_and_at_stops(monkeypatch):
     # In this process, whose imports are done.
-    monkeypatch.setattr(arms, "run_command", lambda _, *words, makes, python: main([str(word) for word in words]))
+    monkeypatch.setattr(
+        arms, "run_command", lambda _, *words, makes, python: main([str(word) for word in words])
+    )
     figures = measure((f"twin:0={SHIPPED}",), seconds=(4.0,), points=3, stops=1)
     [in_time], [stopping] = figures["in time"], figures["stop by stop"]
     assert json.dumps(figures) and in_time["trained"] == stopping["trained"] == "at rest"

@@ -1,5 +1,7 @@
 """The worker of SoRoMoX: the same arm as the project's, forces of pressures, steps of a known robot."""
 
+import json
+import subprocess
 from types import SimpleNamespace
 
 import jax
@@ -91,3 +93,18 @@ def test_arms_of_soromox_move_and_stay_finite():
     with working(worker := Worker("SoRoMoX", program, PYTHON)):
         assert worker.facts == {"arms": 4, "step_ms": 20.0}
         assert worker.round()["simulated_s_per_s"] > 0.0
+
+
+@pytest.mark.skipif(not PYTHON.exists(), reason="the environment of SoRoMoX is not made")
+def test_the_weight_stretches_the_straight_arm_and_does_not_bend_it():
+    lines = (
+        "import json, numpy",
+        "from benchmarks.speed.soromox_worker import build_robot",
+        "from mjx_softarm.spec import ArmSpec",
+        "robot = build_robot(ArmSpec.default())",
+        "print(json.dumps(robot.gravitational_force(numpy.zeros(robot.num_coordinates)).tolist()))",
+    )
+    told = subprocess.run([PYTHON, "-c", "; ".join(lines)], cwd=ROOT, check=True, capture_output=True)
+    bend_y, bend_z, stretch = np.reshape(json.loads(told.stdout), (-1, 3)).T
+    np.testing.assert_allclose([bend_y, bend_z], 0.0, atol=1e-6)
+    assert (stretch < -1.0).all()  # the derivative of the weight's energy
