@@ -29,8 +29,8 @@ N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
 
 
-# An arm that stands must do so without pressure, before it is calibrated: the paper's arm, of 4.7 kg, falls
-# over, a tenth of it stands.
+# Turns [deg] of the base. An arm that stands must do so without pressure, before it is calibrated: the arm of
+# the paper, of 4.7 kg, falls over, a tenth of it stands.
 HANGS, STANDS = (0.0, 0.0, 0.0), (180.0, 0.0, 0.0)
 
 
@@ -44,7 +44,7 @@ class Kind(NamedTuple):
     peer: str = ""  # library of `benchmarks.harness.peers` in whose environment the driver runs
 
     def arm(self, file: Path) -> str:
-        """Return the stand-in's name for `--arm`; `file` has its specification."""
+        """Return the stand-in's name for `--arm`; a rod twin has the specification of `file`."""
         return self.driver or f"twin:rod:0@{file}"
 
     @property

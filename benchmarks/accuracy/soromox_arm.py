@@ -65,8 +65,8 @@ class SoromoxRod:
         # Energy of all parts
         def stretch(q: Array) -> Array:
             """Return lengths (s, per_section, c + k) of the fibres, divided by that of their segment."""
-            rotation, way = jnp.split(robot.strain(q).reshape(n_sections, per_section, 1, 6), 2, axis=-1)
-            return jnp.linalg.norm(way + jnp.cross(rotation, hole_m[:, None]), axis=-1)
+            angular, linear = jnp.split(robot.strain(q).reshape(n_sections, per_section, 1, 6), 2, axis=-1)
+            return jnp.linalg.norm(linear + jnp.cross(angular, hole_m[:, None]), axis=-1)
 
         def tools(q: Array, parts: RodParts) -> Array:
             """Return the places (2, 3) of gripper and payload, in SoRoMoX's axes."""
@@ -74,10 +74,12 @@ class SoromoxRod:
             return end[:3, 3] + parts.tool_offset_m[:, None] * end[:3, 0]
 
         def elastic(q: Array, pressure_kpa: Array, parts: RodParts) -> Array:
+            """Return the energy [J] of backbone and fibres."""
             fibres = fibre_energy(stretch(q), pressure_kpa, parts).sum() / per_section
             return 0.5 * q @ robot.stiffness_matrix() @ q + fibres
 
         def energy(q: Array, pressure_kpa: Array, parts: RodParts) -> Array:
+            """Return the energy [J] of the arm, weight included."""
             height_m = tools(q, parts) @ (_AXES.T @ parts.up)
             weight = robot.gravitational_energy(q) + GRAVITY_M_S2 * parts.tool_mass_kg @ height_m
             return elastic(q, pressure_kpa, parts) + weight
@@ -93,11 +95,15 @@ class SoromoxRod:
             """Return strains, rates, and the largest force before the step."""
             force, slope = (f(q, pressure_kpa, parts) for f in (gradient, jax.jacfwd(gradient)))
             inertia, bias, _ = robot.dynamics_terms(q, v)
+
             # Gripper and payload: inertia, and the force of their acceleration at constant rates
-            arms, kg = jax.jacfwd(tools)(q, parts), parts.tool_mass_kg  # (2, 3, n)
-            turned = jax.jvp(lambda x: jax.jvp(lambda y: tools(y, parts), (x,), (v,))[1], (q,), (v,))[1]
-            inertia += jnp.einsum("tki,tkj,t->ij", arms, arms, kg)
-            bias += jnp.einsum("tki,tk,t->i", arms, turned, kg)
+            def velocity(q: Array) -> Array:
+                return jax.jvp(lambda q: tools(q, parts), (q,), (v,))[1]
+
+            jacobian, kg = jax.jacfwd(tools)(q, parts), parts.tool_mass_kg  # (2, 3, n)
+            acceleration = jax.jvp(velocity, (q,), (v,))[1]
+            inertia += jnp.einsum("tki,tkj,t->ij", jacobian, jacobian, kg)
+            bias += jnp.einsum("tki,tk,t->i", jacobian, acceleration, kg)
             matrix = inertia + step_s * damping + step_s**2 * slope
             pull = -force - bias - damping @ v - step_s * slope @ v
             v = v + jnp.linalg.solve(matrix, step_s * pull)
@@ -148,7 +154,8 @@ class SoromoxRod:
             if left < REST_TOLERANCE:
                 self._v = np.zeros_like(self._v)
                 return
-        raise FloatingPointError(f"rod: got a force of {left:.2g}, expected under {REST_TOLERANCE:g}")
+        got = f"a force of {left:.2g} N m^2 or N m after {SETTLE_STEPS} steps"
+        raise FloatingPointError(f"rod: got {got}, expected under {REST_TOLERANCE:g}")
 
 
 def fibre_energy(stretch: Array, pressure_kpa: Array, parts: RodParts) -> Array:
@@ -231,7 +238,7 @@ def beside_rod(seed: int, n: int) -> dict[str, Any]:
         apart_mm.append(1e3 * float(np.linalg.norm(one - other)))
     # Strains of a rod: bending x and y, torsion, shear x and y, stretch
     own, rods = (np.reshape(arm._rod.damping, (-1, 6)) for arm in arms)
-    ratio = own[:, [2, 1, 0, 4, 5, 3]] / rods
+    ratio = own[:, [1, 2, 0, 4, 5, 3]] / rods
     return {"apart_mm": apart_mm, "damping_ratio": [float(ratio.min()), float(ratio.max())]}
 
 

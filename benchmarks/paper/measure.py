@@ -25,7 +25,7 @@ from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion
 
 GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
 PLACE_M = 0.04  # finger tips to the middle of a container
-PADDING_N_PER_M = GRAVITY_M_S2 * APPLE_KG / 0.01  # of a container's floor, into which an apple sinks 10 mm
+PADDING_N_PER_M = GRAVITY_M_S2 * APPLE_KG / 0.01  # stiffness of a container's floor; an apple sinks in 10 mm
 PACE_S = 1.0  # from a position to the next, where the arm does not stop
 CALM_N = 1.0  # contact force that counts as none
 # Masses in the containers when a task begins: the one picked first, then the one picked second.
@@ -82,7 +82,7 @@ class Gripper:
             _container(names[k]): (goals_m[k], kg) for k, kg in zip(picks, masses_kg, strict=False)
         }
         self._held_kg: float | None = None
-        self._hung_kg = 0.0  # part of it that no floor carries
+        self._hung_kg = 0.0  # mass of the held object that no floor carries
         self._floors_m = np.array(
             [goals_m[k] for k, name in enumerate(names) if name.startswith(("pick", "place"))]
         )
@@ -156,6 +156,7 @@ def operate(
     gripper = Gripper(twin, names, finger_tips(goals, gripper_m), objects, gripper_m)
 
     def driven() -> None:
+        """Note the wall's force of a control period, and let a floor carry what is held."""
         forces_n.append(force()[0])
         gripper.driven()
 

@@ -1,8 +1,10 @@
 """Strategies towards a moving goal. Pure; NumPy only.
 
-policy     strategy
-at rest    `Predicting`  acts several times in each tick, each time from a predicted pose
-in motion  `Chasing`     acts in each tick
+    policy     strategy
+    at rest    `Predicting`  acts several times in each tick, each time from a predicted pose
+    in motion  `Chasing`     acts in each tick
+
+Both are given the goal ahead, corrected by the error of the way so far (`mjx_softarm.deploy.moving.error`).
 """
 
 from __future__ import annotations

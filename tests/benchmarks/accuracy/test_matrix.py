@@ -20,8 +20,8 @@ def test_what_cannot_be_measured_is_refused_before_anything_is(tmp_path, monkeyp
         matrix.measure(())
     with pytest.raises(InputError, match="--runs: got the engine warp, expected chain or mjx"):
         trained_in(EnvConfig(mode="dynamic", engine="warp"))
-    with pytest.raises(InputError, match="--runs: got the arm mine:Arm, expected twin:SEED"):
-        matrix.kind_of("mine:Arm")
+    with pytest.raises(InputError, match="--runs: got the arm soromoxx, expected twin:SEED"):
+        matrix.kind_of("soromoxx")
     monkeypatch.setattr(matrix.Run, "open", lambda folder: None)
     with pytest.raises(InputError, match="got no policy.npz, expected an exported run"):
         matrix.opened(tmp_path)
@@ -99,6 +99,9 @@ def test_targets_compare_means_with_that_of_the_training():
 
 def test_soromox_s_worker_is_asked_for_distances(monkeypatch):
     monkeypatch.setattr("benchmarks.accuracy.arms.peer_python", lambda name: "peer")
-    told = SimpleNamespace(stdout=json.dumps({"apart_mm": [0.5, 0.1]}))
+    told = SimpleNamespace(returncode=0, stdout=json.dumps({"apart_mm": [0.5, 0.1]}))
     monkeypatch.setattr(matrix.subprocess, "run", lambda command, **rest: told)
     assert matrix.beside_soromox() == {"poses": 2, "mean [mm]": 0.3, "largest [mm]": 0.5}
+    told.returncode = 1
+    with pytest.raises(InputError, match="soromox_arm 0 20: got exit status 1, expected 0"):
+        matrix.beside_soromox()
