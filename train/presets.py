@@ -28,7 +28,8 @@ _TUNED = TQCConfig(
 
 # Goals uniform in volume lie at the rim more often. `analytic`, three seeds: with half of them, 95 % of the
 # goals uniform in volume are within 3.8 mm, of those of random pressures 0.75; with four fifths 2.9 and 0.79.
-# `payload` has more to learn: halfway through a training, its circle is 0.51 mm off with these, 0.32 with half.
+# `payload` has more to learn: halfway through a training its circle is 0.51 mm off with these, 0.32 with
+# half.
 _EVEN = EnvConfig(n_poses=4_096, even_share=0.8)
 _MOVING = EnvConfig(
     mode="dynamic",
@@ -87,7 +88,7 @@ PRESETS: dict[str, TrainConfig] = {
         env=EnvConfig(reward=_ALWAYS),
     ),
     "analytic": TrainConfig(learner=AnalyticConfig(), evaluation_epochs=24, fresh_poses_epochs=4, env=_EVEN),
-    # The same for an arm that carries: the policy observes the payload, which the loop estimates.
+    # For an arm that carries: the policy observes the payload, which the loop estimates.
     "payload": TrainConfig(
         learner=AnalyticConfig(),
         evaluation_epochs=24,

@@ -22,7 +22,8 @@ from mjx_softarm.spec import ARM_FILE
 
 # Without S2R a pose is off by several millimetres: a sixth of the steps teaches it.
 WITHOUT_S2R = ("learner.total_env_steps=524288",)
-# Presets that differ in the payload alone: a run beside the experiment's own gets the same further settings.
+# Presets of one learner, with and without the payload: a run beside the experiment's own gets the same
+# further settings.
 ALIKE = {"analytic", "payload"}
 MOVING, N_MOVING = "moving.npz", 8  # log of a rod in motion, and its number of poses
 
