@@ -62,13 +62,14 @@ def measure(runs: tuple[str, ...], points: int = 8) -> dict[str, Any]:
     """
     xla.enable_compilation_cache()
     # What may fail comes first
-    chosen = [(arm, opened(Path(folder))) for arm, folder in arms_and_files(runs, "--runs", "RUN")]
-    heads = [{"trained in": trained_in(run.config.env), "arm": arm} for arm, run in chosen]
-    for arm, _ in chosen:
-        kind_of(arm)
+    chosen = []
+    for arm, folder in arms_and_files(runs, "--runs", "RUN"):
+        run = opened(Path(folder))
+        chosen.append((run, arm, kind_of(arm), trained_in(run.config.env)))
     beside, rows = beside_soromox(), []
-    for head, (arm, run) in zip(heads, chosen, strict=True):
-        rows.append({**head, **in_simulations(run, points), **on_arm(run, arm, points)})
+    for run, arm, kind, trained in chosen:
+        measured = in_simulations(run, points) | dict.fromkeys(ARM_KINDS) | {kind: on_arm(run, arm, points)}
+        rows.append({"trained in": trained, "arm": arm, **measured})
         print(rows[-1], flush=True)
     found = {"points": points, "means": means(rows), "targets": targets(rows)}
     return found | {"rod beside SoRoMoX": beside, "runs": rows}
@@ -132,20 +133,20 @@ def kind_of(arm: str) -> str:
     raise InputError(f"--runs: got the arm {arm}, expected twin:SEED, twin:rod:SEED or {SOROMOX}")
 
 
-def on_arm(run: Run, arm: str, points: int) -> dict[str, float | None]:
-    """Return the mean error [mm] on the circle of the exported policy, for the kind of its arm.
+def on_arm(run: Run, arm: str, points: int) -> float:
+    """Return the mean error [mm] on the circle of the exported policy, on its arm.
 
     Raises:
         InputError: a goal was not measured.
     """
-    kind, soromox = kind_of(arm), ARMS[SOROMOX]
+    soromox = ARMS[SOROMOX]
     name, python = (soromox.driver, soromox.python) if arm == SOROMOX else (arm, sys.executable)
     with tempfile.TemporaryDirectory() as folder:
         out, asked = Path(folder, "circle"), ("--points", points)
         told = accuracy_of(run.path / POLICY_FILE, name, out, *asked, python=python)
     if told["measured"] < points:
         raise InputError(f"--runs: {arm}={run.path}: got {told['measured']} of {points} goals, expected all")
-    return dict.fromkeys(ARM_KINDS) | {kind: told["translation_mm"]}
+    return told["translation_mm"]
 
 
 def beside_soromox() -> dict[str, float]:

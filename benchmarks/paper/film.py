@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from benchmarks.paper.kinds import KINDS, Trial
-from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_tips, operate
+from benchmarks.paper.measure import WatchedTwin, below_tips, finger_tips, operate
 from benchmarks.paper.scene import Scene
 from mjx_softarm._support.files import replacing
 from mjx_softarm.mechanics.pipe import PIPES, CrossPipe
@@ -40,8 +40,8 @@ def film(path: Path, scene: Scene, trial: Trial) -> None:
         def shoot() -> None:
             if scene.twin.time_s >= PERIOD_S * len(pictures):
                 pictures.append(scene.twin.draw(renderer))
-                seen = scene.twin.motion_capture()
-                tips_m.append(captured_finger_tips(seen.tip_m, seen.tip_quaternion, gripper_m))
+                tip_m, rotation = scene.twin.tip()
+                tips_m.append(below_tips(tip_m, rotation, gripper_m))
 
         operate(WatchedTwin(scene.twin, shoot), *scene[1:], trial.objects)
     write_gif(path, frames(pictures, 1e3 * np.array(tips_m), side))

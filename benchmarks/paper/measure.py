@@ -20,12 +20,11 @@ from mjx_softarm.deploy.ending import LoopRun
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
-from mjx_softarm.mechanics.statics import GRAVITY_M_S2
-from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion
+from mjx_softarm.sensing.pose import frame_from_pose
 
 GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
 PLACE_M = 0.04  # finger tips to the middle of a container
-PADDING_N_PER_M = GRAVITY_M_S2 * APPLE_KG / 0.01  # stiffness of a container's floor; an apple sinks in 10 mm
+PADDING_KG_PER_M = APPLE_KG / 0.01  # weight that a container's floor carries: an apple sinks in 10 mm
 PACE_S = 1.0  # from a position to the next, where the arm does not stop
 CALM_N = 1.0  # contact force that counts as none
 # Masses in the containers when a task begins: the one picked first, then the one picked second.
@@ -95,7 +94,7 @@ class Gripper:
         off_m = self.finger_m() - self._floors_m
         near = np.linalg.norm(off_m[:, :2], axis=1) <= PLACE_M
         above_m = off_m[near, 2].min(initial=np.inf)
-        hung_kg = float(np.clip(PADDING_N_PER_M * above_m / GRAVITY_M_S2, 0.0, self._held_kg))
+        hung_kg = float(np.clip(PADDING_KG_PER_M * above_m, 0.0, self._held_kg))
         if hung_kg != self._hung_kg:
             self._hung_kg = hung_kg
             self._arm.attach(hung_kg)
@@ -119,7 +118,7 @@ class Gripper:
     def finger_m(self) -> np.ndarray:
         """Return the true place of the finger tips (3,) [m]."""
         tip_m, rotation = self._arm.tip()
-        return tip_m - self._gripper_m * rotation[:, 2]
+        return below_tips(tip_m, rotation, self._gripper_m)
 
 
 def _container(name: str) -> str:
@@ -128,13 +127,12 @@ def _container(name: str) -> str:
 
 def finger_tips(pose: np.ndarray, gripper_m: float) -> np.ndarray:
     """Return the finger tips (..., 3) [m] of poses (..., 6) [mm, deg]."""
-    position_m, rotation = frame_from_pose(pose)
-    return position_m - gripper_m * rotation[..., 2]
+    return below_tips(*frame_from_pose(pose), gripper_m)
 
 
-def captured_finger_tips(tip_m: np.ndarray, quaternion: np.ndarray, gripper_m: float) -> np.ndarray:
-    """Return the finger tips (..., 3) [m] of tips (..., 3) [m] with quaternions (..., 4)."""
-    return tip_m - gripper_m * rotation_from_quaternion(quaternion)[..., 2]
+def below_tips(tip_m: np.ndarray, rotation: np.ndarray, gripper_m: float) -> np.ndarray:
+    """Return the finger tips (..., 3) [m] of tips (..., 3) [m] with rotations (..., 3, 3)."""
+    return tip_m - gripper_m * rotation[..., 2]
 
 
 def operate(

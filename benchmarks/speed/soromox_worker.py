@@ -77,6 +77,7 @@ def build_robot(spec: ArmSpec) -> Any:
     from soromox.systems import PCS, PCSStructure  # pyright: ignore[reportMissingImports]
     from soromox.systems.components import LinkSpec  # pyright: ignore[reportMissingImports]
 
+    # Radius and mass of each section
     geometry, n = spec.geometry, spec.structure.n_sections
     radius_m = np.add(
         spec.per_section(geometry.chamber_radius_m),
@@ -84,6 +85,8 @@ def build_robot(spec: ArmSpec) -> Any:
     )
     mass_kg = np.array(spec.section_mass_kg)
     mass_kg[-1] += spec.mass.gripper_kg + spec.mass.payload_kg
+
+    # A segment for each
     stiffness, damping = (section_matrices(spec, kind) for kind in ("stiffness", "damping"))
     links = [
         LinkSpec.circular(

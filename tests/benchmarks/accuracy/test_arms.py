@@ -77,6 +77,14 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
     python, *words = told[-1]
     assert python == sys.executable and words[words.index("--payload") + 1] == "500"
     assert words[words.index("--arm") + 1] == f"twin:rod:0@{tmp_path / 'arm.toml'}"
+    monkeypatch.setattr(arms, "peer_python", lambda name: f"python of {name}")
+    told.clear()
+    (tmp_path / "soromox/run").mkdir(parents=True)
+    (tmp_path / "soromox/run/evaluation.json").write_text("{}")  # its training is not what is tested here
+    arms._measure("soromox", tmp_path / "soromox", 300, "analytic", None, 4)
+    with_arm = [python for python, *words in told if "--arm" in words]
+    without_arm = [python for python, *words in told if "--arm" not in words]
+    assert with_arm == ["python of soromox"] * 4 and set(without_arm) == {sys.executable}
     missed = found | {"circle, measured": 3}
     far = found | {"circle, mean [mm]": 3.01}
     rows = arms.targets([found, missed, far], ["a", "b", "c"])
