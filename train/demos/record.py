@@ -86,15 +86,17 @@ class WaypointRecorder:
         return self._rows.log("demonstrations", self._drive.sensor)
 
     def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
-        """Return the row at rest and the error [m] of the finger tips, after at most `N_CORRECTIONS`."""
+        """Return the row at rest with the least error [m] of the finger tips, after at most `N_CORRECTIONS`."""
         target = asked = self.expert.target(waypoint)
-        row, off_m = None, np.nan
+        best, off_m, held = None, np.nan, posture
         for n_left in range(N_CORRECTIONS, -1, -1):
             # Hold the posture until rest. Where the tip is seen, move the target by its error.
             row = self._drive.to_rest(Hold(self._drive.gains, posture.spring_m, self._drive.dt_s))
             if row is not None:
-                off_m, asked = self._corrected(row, target, asked)
-                if not off_m >= CLOSE_M:  # close, or not seen
+                now_m, asked = self._corrected(row, target, asked)
+                if best is None or now_m < off_m:
+                    best, off_m, held = row, now_m, posture
+                if not now_m >= CLOSE_M:  # close, or not seen
                     break
             if not n_left:
                 break
@@ -105,16 +107,16 @@ class WaypointRecorder:
             except ExpertError as error:
                 self.tell(f"not corrected: {error}")
                 break
-        # Refuse a pose without rest, or far from its waypoint.
-        if row is None:
+        # Refuse a waypoint without rest, or a pose far from it.
+        if best is None:
             raise self._not_at_rest(waypoint.name, posture)
         if off_m > FAR_M:
             off = f"got {1e3 * off_m:.1f} mm off after corrections, expected at most {1e3 * FAR_M:g} mm"
             raise ArmFault(f"{waypoint.name}: {off}; is the arm calibrated?")
         if not self._drive.link.sees:
-            pose = posture.pose.astype(float)
-            row = {"tip_m": 1e-3 * pose[:3], "tip_quaternion": quaternion_from_pose(pose)} | row
-        return row, off_m
+            pose = held.pose.astype(float)
+            best = {"tip_m": 1e-3 * pose[:3], "tip_quaternion": quaternion_from_pose(pose)} | best
+        return best, off_m
 
     def _corrected(
         self, row: dict, target: PostureTarget, asked: PostureTarget

@@ -100,6 +100,23 @@ def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, 
     assert result.ending.status == 0 and result.off_m.max() < CLOSE_M
 
 
+def test_best_pose_is_logged_where_corrections_find_no_rest(expert, waypoints, plan, shift_mm):
+    """The first pose is off by the shift; after it the expert asks for springs that no pressure makes."""
+
+    class Worse:
+        spec, target = expert.spec, expert.target
+
+        def reach(self, name, target, before_kpa):
+            found = expert.reach(name, target, before_kpa)
+            return found._replace(spring_m=found.spring_m + 0.06 * (np.arange(9) == 4))
+
+    result = WaypointRecorder(IdealArm(), Worse()).record(waypoints[:1], plan)
+    assert result.ending.status == 0
+    np.testing.assert_allclose(result.off_m, 1e-3 * np.linalg.norm(shift_mm), rtol=0.1)
+    wanted_m = np.stack([waypoints[0].finger_m])
+    np.testing.assert_allclose(np.linalg.norm(fingers_m(result.log) - wanted_m, axis=1), result.off_m)
+
+
 class Lost(IdealArm):
     """Readings are lost some ticks after the first pose was logged."""
 
