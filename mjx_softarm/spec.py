@@ -34,6 +34,9 @@ from mjx_softarm.spec_tables import (
 )
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
+# Lag of a section's shape over damping by stiffness of its backbone: chambers and weight stiffen it, too.
+# Of the paper's arm, simulated on the circle in 20 s.
+SHAPE_SHARE = 0.65
 MOST_RATIO = 3.0  # of a spring's length and that of its section, either way; more is a slip
 
 
@@ -119,6 +122,18 @@ class ArmSpec:
         """Own mass of each section."""
         n, arm_kg = self.structure.n_sections, self.mass.arm_kg
         return arm_kg if isinstance(arm_kg, tuple) else (arm_kg / n,) * n
+
+    @property
+    def shape_lag_s(self) -> float:
+        """Time constant with which a section's bend is shared out within it, a mean over the sections."""
+        # Bending stiffness of the backbone, and of chambers that are bonded to it (`ArmParams.bonded`)
+        backbone, chambers, c = self.backbone, self.chambers, self.structure.chambers_per_section
+        least = np.reshape(self.per_chamber(chambers.stiffness_n_per_m), (-1, c)).min(axis=1)
+        radius_m = np.array(self.per_section(self.geometry.chamber_radius_m))
+        bonded = chambers.bonded_share * c * least * radius_m**2 / 2
+        stiffness = np.array(self.per_section(backbone.bending_stiffness_nm_per_rad)) + bonded
+        damping = self.per_section(backbone.bending_damping_nms_per_rad)
+        return SHAPE_SHARE * float(np.mean(np.divide(damping, stiffness)))
 
     @property
     def section_roll_deg(self) -> tuple[float, ...]:

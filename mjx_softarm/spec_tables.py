@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from mjx_softarm._support.fields import (
     PerChamber,
     PerSection,
@@ -14,14 +12,15 @@ from mjx_softarm._support.fields import (
     not_negative,
     numbers,
     positive,
+    share,
     vector,
 )
 
 PAIRS = "pairs of chamber and spring"
 LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
-# Lag of a section's shape over damping by stiffness of its backbone: chambers and weight stiffen it, too.
-# Of the paper's arm, simulated on the circle in 20 s.
-SHAPE_SHARE = 0.65
+# Below, the backbones of stiff chambers would be left without stiffness; a share of 1 would leave no chamber
+# that pulls between the ends of its section.
+BONDS = -0.3, 0.95
 # Upper bounds that no soft arm exceeds, but its number in another unit does.
 LENGTH = {"high": 2.0, "unit": "m, not mm"}
 MASS = {"high": 50.0, "unit": "kg, not g"}
@@ -73,7 +72,12 @@ class Mass:
 
 @dataclass(frozen=True)
 class Chambers:
-    """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length))."""
+    """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length)).
+
+    A bellows that is free between the ends of its section resists a change of its length alone. One that is
+    bonded to every ring resists the bend of each link, too: `bonded_share` of it does. A negative share makes
+    links softer, as more of them would be.
+    """
 
     area_m2: PerChamber = positive(per="chambers", **AREA)
     area_slope_m: PerChamber = anything(per="chambers")
@@ -82,6 +86,7 @@ class Chambers:
     length_offset_m: PerChamber = anything(per="chambers", low=-0.1, high=0.1)
     pressure_min_kpa: float = anything(low=-101.325, **PRESSURE)
     pressure_max_kpa: float = anything(low=-101.325, **PRESSURE)
+    bonded_share: float = share(*BONDS)
 
 
 @dataclass(frozen=True)
@@ -92,12 +97,6 @@ class Backbone:
     bending_stiffness_nm_per_rad: PerSection = positive(per="sections")
     axial_damping_ns_per_m: PerSection = not_negative(per="sections")
     bending_damping_nms_per_rad: PerSection = not_negative(per="sections")
-
-    @property
-    def shape_lag_s(self) -> float:
-        """Time constant with which a section's bend is shared out within it, a mean over the sections."""
-        stiffness, damping = self.bending_stiffness_nm_per_rad, self.bending_damping_nms_per_rad
-        return SHAPE_SHARE * float(np.mean(np.divide(damping, stiffness)))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from calib.fit.parameters import marker_sites, with_numbers
+from calib.fit.parameters import free_arm, marker_sites, with_numbers
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
@@ -46,7 +46,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
 
     Args:
         x (p,): see `calib.fit.parameters`.
-        params: arm at x = 0; its payload is not used.
+        params: arm at x = 0, with free chambers; its payload is not used.
         measured: measurements of one pose.
 
     Returns:
@@ -121,7 +121,8 @@ def simulate(spec: ArmSpec, measured: Measured, x: np.ndarray) -> tuple[np.ndarr
         Errors (n, m) of `residuals`, inf where the arm does not settle; their Jacobian (n, m, p); chamber
         lengths (n, n_chambers) [m].
     """
-    simulated = functools.partial(_jacobian(), np.float32(x), ArmParams.from_spec(spec))
+    start, params = free_arm(spec, x)
+    simulated = functools.partial(_jacobian(), np.float32(start), params)
     error, slope, settled, chamber_m = xla.in_batches(simulated, BATCH, measured)
     return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
 

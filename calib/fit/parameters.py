@@ -5,6 +5,8 @@ Each entry is a change from the specification:
 - per chamber: logarithms of the ratios of stiffness and area; slope of the area, in areas per section length;
   rest length, in section lengths
 - backbone: logarithm of the ratio of the bending stiffness, one for all sections
+- share of the chambers that is bonded to the backbone, one for all sections. Weights show it, the arm's own
+  and a payload: they bend the links of a section unlike each other, and more where chambers are free
 - mounting: turn of the base about its own x and y, and its offset; roll of each section's holes; turn of the
   measured tip, and its offset within the last plate. A turn of the base about its own z is a roll of all
   sections. An axial offset of the tip cannot be told from an offset of the base.
@@ -32,11 +34,12 @@ from mjx_softarm._support.small_matrices import product
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.pose import rotation_about, rotation_from_quaternion, rotation_vector
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import Structure
+from mjx_softarm.spec_tables import BONDS, Structure
 
 # The four parameters of a chamber.
 FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")
 BENDING = "bending_stiffness_nm_per_rad"  # field of the backbone
+BOND = "bonded_share"  # field of the chambers
 
 
 class Block(NamedTuple):
@@ -56,6 +59,7 @@ BLOCKS = (
     Block("slope", "chamber", 0, 1.0, 0.05),  # prior an area per section length
     Block("offset", "chamber", 0, 0.25, 0.005, order=1),  # prior a quarter, tolerance 1 mm of 200 mm
     Block(BENDING, "", 1, 1.0, 0.05),  # prior a factor of e, tolerance 5 %
+    Block(BOND, "", 1, 0.5, 0.1),  # prior half of them, tolerance 0.1
     Block("base turn", "", 2, 0.1, 0.01),  # [rad] prior 6 deg, tolerance 0.6 deg
     Block("base offset", "", 3, 0.01, 0.002),  # [m]
     Block("roll", "section", 0, 0.2, 0.01),  # [rad] prior 11 deg
@@ -73,7 +77,9 @@ def priors(spec: ArmSpec) -> np.ndarray:
 
 def tolerances(spec: ArmSpec) -> np.ndarray:
     """Return errors (p,) within which parameters count as known."""
-    return np.concatenate([np.full(_size(block, spec.structure), block.tolerance) for block in BLOCKS])
+    one_link = spec.structure.links_per_section == 1  # a bond changes nothing there
+    sizes = ((block, _size(block, spec.structure)) for block in BLOCKS)
+    return np.concatenate([np.full(n, 1.0 if one_link and b.name == BOND else b.tolerance) for b, n in sizes])
 
 
 def names(spec: ArmSpec) -> list[str]:
@@ -130,13 +136,13 @@ def by_name(x: Array | np.ndarray, structure: Structure) -> dict[str, Any]:
 
 
 def with_numbers(x: Array, params: ArmParams) -> ArmParams:
-    """Return the arm at x (p,) where `params` is the arm at x = 0."""
+    """Return the arm at x (p,) where `params` is the arm at x = 0, with free chambers."""
     by = by_name(x, _structure_of(params))
     bend = jnp.exp(by[BENDING][0])
     joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
     mount, zero = params.mount, jnp.zeros(1, x.dtype)
     base_turn = _turned(jnp.concatenate([by["base turn"], zero]))
-    return params._replace(
+    free = params._replace(
         chamber_site_m=_rolled(params.chamber_site_m, by["roll"]),
         spring_site_m=_rolled(params.spring_site_m, by["roll"]),
         joint_stiffness=joints.reshape(-1),
@@ -151,6 +157,14 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
             tip_rotation=product(jnp.asarray(mount.tip_rotation), _turned(by["tip turn"])),
         ),
     )
+    return free.bonded(jnp.clip(by[BOND][0], *BONDS))
+
+
+def free_arm(spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, ArmParams]:
+    """Return x (p,) and the arm for `with_numbers`: x counts the bonded share from that of `spec`."""
+    at = names(spec).index(BOND)
+    params = ArmParams.from_spec(spec.replace(chambers={BOND: 0.0}))
+    return x + spec.chambers.bonded_share * (np.arange(len(x)) == at), params
 
 
 def marker_sites(x: Array, params: ArmParams) -> Array:
@@ -189,6 +203,7 @@ def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
         "area_slope_m": old["area_slope_m"] + by["slope"] * old["area_m2"] / length_m,
         "length_offset_m": old["length_offset_m"] + by["offset"] * length_m,
     }
+    bond = float(np.clip(spec.chambers.bonded_share + by[BOND][0], *BONDS))
     # Turn and shift the mounting.
     base, tip = (rotation_about(np.radians(v)) for v in (mounting.base_turn_deg, mounting.tip_turn_deg))
     base = base @ np.asarray(_turned(jnp.append(by["base turn"], 0.0)), float)
@@ -202,7 +217,7 @@ def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
     }
     bending = scaled(spec.backbone.bending_stiffness_nm_per_rad, float(np.exp(by[BENDING][0])))
     return spec.replace(
-        chambers={name: tuple(map(float, value)) for name, value in chambers.items()},
+        chambers={name: tuple(map(float, value)) for name, value in chambers.items()} | {BOND: bond},
         backbone={BENDING: bending},
         mounting={name: tuple(map(float, value)) for name, value in turned.items()},
     )
@@ -227,6 +242,7 @@ def half_widths(spec: ArmSpec, covariance: np.ndarray) -> dict[str, np.ndarray]:
         "area_slope_m": area / length_m * by["slope"],
         "length_offset_m": length_m * by["offset"],
         BENDING: np.multiply(spec.backbone.bending_stiffness_nm_per_rad, by[BENDING][0]),
+        BOND: by[BOND][0],
         "base_turn_deg": np.append(np.degrees(by["base turn"]), 0.0),
         "base_offset_m": by["base offset"],
         "section_roll_deg": np.degrees(by["roll"]),

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import PressureFit
 from calib.fit.markers import MarkerLimits
-from calib.fit.parameters import BENDING, without_effect
+from calib.fit.parameters import BENDING, BOND, without_effect
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
@@ -82,7 +82,9 @@ def chambers(fit: ChamberFit) -> Section:
         rows.append((f"chamber {k}", *(number for pair in pairs for number in pair)))
     head = ("", *(text for _, title, _ in units for text in (title, "+-")))
     bending = spec.backbone.bending_stiffness_nm_per_rad
-    backbone = ReportTable(("", "value", "+-"), per_part(BENDING, bending, fit.half_width_95[BENDING]))
+    parts = ((BENDING, bending), (BOND, spec.chambers.bonded_share))
+    rows_of = (row for name, value in parts for row in per_part(name, value, fit.half_width_95[name]))
+    backbone = ReportTable(("", "value", "+-"), tuple(rows_of))
     mounting = _mounting(fit)
     errors = _errors(
         ("held-out poses, before", fit.held_out_before),
@@ -107,7 +109,7 @@ def chambers(fit: ChamberFit) -> Section:
         (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
         plain(fit, "spec", "covariance", "poses", "is_held_out", "tip_error_mm", "chamber_m")
-        | {"values": values | {BENDING: bending} | dataclasses.asdict(spec.mounting)},
+        | {"values": values | dict(parts) | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
         fit.notes,
     )

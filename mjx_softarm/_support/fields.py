@@ -75,6 +75,11 @@ def anything(per: str = "", low: float = -math.inf, high: float = math.inf, unit
     return field(metadata={"rule": Rule(low=low, high=high, per=per, unit=unit)})
 
 
+def share(low: float = 0.0, high: float = 1.0) -> Any:
+    """Declare a share in a range, by default 0."""
+    return field(default=0.0, metadata={"rule": Rule(low=low, high=high)})
+
+
 def vector() -> Any:
     """Declare three numbers, by default zeros."""
     return field(default=(0.0, 0.0, 0.0), metadata={"rule": Rule(length=3)})

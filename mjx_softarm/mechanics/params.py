@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.control import Allocation, allocation
 from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_directions
 from mjx_softarm.mechanics.pipe import Contact
@@ -72,7 +73,8 @@ class ArmParams(NamedTuple):
     @property
     def free_length_m(self) -> Array:
         """(n_chambers, *arms) length of each chamber's section at rest."""
-        return jnp.repeat(self.section_length_m, self.chamber_site_m.shape[1], axis=0)
+        xp = array_namespace(self.section_length_m)
+        return xp.repeat(self.section_length_m, self.chamber_site_m.shape[1], axis=0)
 
     @property
     def pinned(self) -> Array:
@@ -97,6 +99,30 @@ class ArmParams(NamedTuple):
         return self._replace(
             spring_stiffness=jnp.where(held, stiffness, self.spring_stiffness),
             spring_rest_m=jnp.where(held, pull / stiffness, self.spring_rest_m),
+        )
+
+    def bonded(self, share: Array | np.ndarray) -> ArmParams:
+        """Return the arm, whose chambers are free between the ends of their sections, with a share bonded.
+
+        Of each chamber the same stiffness goes to the links of its section, as `share` of the least stiff
+        one has. So an arm whose links bend and stretch alike is as stiff as before.
+        """
+        # Stiffness that each chamber of a section gives
+        xp, (n_sections, c, _) = array_namespace(self.chamber_stiffness), self.chamber_site_m.shape
+        stiffness, free_m = self.chamber_stiffness.reshape(n_sections, c), self.free_length_m
+        given = share * xp.min(stiffness, axis=1)  # (n_sections,)
+        left = (stiffness - given[:, None]).reshape(-1)
+        # Joints that take it: stretching, and bending about x and y
+        per_section = self.link_length_m.shape[0] // n_sections
+        square_m2 = xp.mean(xp.sum(self.chamber_site_m**2, axis=-1), axis=1)
+        bend = given * square_m2 / 2
+        joints = c * per_section * xp.stack([given, bend, bend], axis=-1)
+        joints = xp.broadcast_to(joints[:, None], (n_sections, per_section, 3)).reshape(-1)
+        return self._replace(
+            chamber_stiffness=left,
+            # Rest lengths pull as before at the section's length
+            chamber_rest_m=free_m + self.chamber_stiffness / left * (self.chamber_rest_m - free_m),
+            joint_stiffness=self.joint_stiffness + joints,
         )
 
     @classmethod
@@ -131,7 +157,8 @@ class ArmParams(NamedTuple):
         }
         numbers = {name: np.asarray(value, dtype) for name, value in values.items()}
         matrices = jax.tree.map(lambda matrix: matrix.astype(dtype), allocation(spec))
-        return cls(**numbers, mount=_mount(spec, dtype), allocation=matrices)  # type: ignore
+        free = cls(**numbers, mount=_mount(spec, dtype), allocation=matrices)  # type: ignore
+        return free.bonded(np.asarray(chambers.bonded_share, dtype))
 
 
 def _law_stiffness(spec: ArmSpec) -> np.ndarray:

@@ -78,6 +78,6 @@ class ShapeLag(NamedTuple):
         # The arm begins at rest
         if self.uneven is None:
             return ShapeLag(uneven), np.zeros(6)
-        lag_s = policy.spec.backbone.shape_lag_s
+        lag_s = policy.spec.shape_lag_s
         now = self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven)
         return ShapeLag(now), pose_error(uneven, now)

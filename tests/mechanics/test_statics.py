@@ -41,6 +41,7 @@ def odd_arm(sections=3, links=4):
             "area_slope_m": spread(-4.06e-3),
             "stiffness_n_per_m": spread(506.7),
             "length_offset_m": tuple(rng.uniform(-0.01, 0.01, n)),
+            "bonded_share": 0.4,
         },
     )
 
@@ -110,6 +111,27 @@ def test_the_hessian_is_the_slope_of_c_mujoco_s_force(structure):
     np.testing.assert_allclose(hessian, np.array(columns).T, atol=1e-7 * np.abs(hessian).max())
 
 
+def test_bonded_chambers_resist_links_that_bend_unlike_each_other_and_no_others():
+    """The energy of a section of like links stays; that of a shape without sum grows by the links' own."""
+    bonded, share, links = odd_arm(), 0.4, 4
+    free = bonded.replace(chambers={"bonded_share": 0.0})
+    rng, pressure_kpa = np.random.default_rng(0), np.zeros(9, np.float32)
+    section, sign = 1e-3 * rng.normal(size=(3, 1, 3)), np.array([1.0, -1.0, -1.0, 1.0])[:, None]
+
+    def change(shape):
+        """By how much bonds raise q^T (gradient of q less that of none), twice the elastic energy."""
+        q = np.broadcast_to(shape, (3, links, 3)).reshape(-1).astype(np.float32)
+        of = [ArmParams.from_spec(spec) for spec in (free, bonded)]
+        pulls = [_statics(x, pressure_kpa, p)[0].gradient for p in of for x in (q, 0 * q)]
+        return float(q @ (pulls[2] - pulls[3]) - q @ (pulls[0] - pulls[1])), float(q @ (pulls[0] - pulls[1]))
+
+    alike, size = change(section)
+    assert abs(alike) < 0.01 * size
+    least = np.reshape(free.chambers.stiffness_n_per_m, (3, 3)).min(axis=1)
+    each = 3 * links * share * least[:, None] * [1.0, *2 * [free.geometry.chamber_radius_m**2 / 2]]
+    assert change(section * sign)[0] == pytest.approx(links * (each * section[:, 0] ** 2).sum(), rel=0.01)
+
+
 def test_single_precision_is_far_finer_than_what_counts_as_settled():
     spec = ArmSpec.default()
     for seed in range(20):
@@ -122,7 +144,7 @@ def test_single_precision_is_far_finer_than_what_counts_as_settled():
 
 
 def test_parameters_are_the_specification_s_in_base_units():
-    spec = odd_arm()
+    spec = odd_arm().replace(chambers={"bonded_share": 0.0})
     params = ArmParams.from_spec(spec, np.float64)
     np.testing.assert_allclose(params.area, 1e3 * np.array(spec.chambers.area_m2))  # N per kPa
     np.testing.assert_allclose(params.chamber_rest_m, 0.2 + np.array(spec.chambers.length_offset_m))

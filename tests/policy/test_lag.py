@@ -38,7 +38,7 @@ def test_the_shape_lags_by_the_time_constant_of_the_backbone_and_is_at_rest_with
         n_in = len(inputs(estimate_frame(policy.estimator, straight_m, 0.0), straight_m))
         layers = ((np.full((n_in, 6), 0.1, np.float32), np.zeros(6, np.float32)),)
         policy = dataclasses.replace(policy, s2r=s2r_of(layers, 0.1))
-    lag_s, rate_m_per_s = SPEC.backbone.shape_lag_s, 5e-3 * (np.arange(N) == N - 1)
+    lag_s, rate_m_per_s = SPEC.shape_lag_s, 5e-3 * (np.arange(N) == N - 1)
     start_m = np.full(N, SPEC.geometry.section_length_m)  # the straight arm, whose plates are level
     shape, behind = ShapeLag().after(policy, start_m, load_kg, DT_S)
     assert not behind.any()

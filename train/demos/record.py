@@ -86,7 +86,7 @@ class WaypointRecorder:
         return self._rows.log("demonstrations", self._drive.sensor)
 
     def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
-        """Return the row at rest with the least error [m] of the finger tips, after at most `N_CORRECTIONS`."""
+        """Return the row at rest with the least error [m] of the finger tips, and that error."""
         target = asked = self.expert.target(waypoint)
         best, off_m, held = None, np.nan, posture
         for n_left in range(N_CORRECTIONS, -1, -1):

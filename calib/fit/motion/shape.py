@@ -2,7 +2,7 @@
 
 At rest a section does not bend evenly: weight bends its upper part more. Springs do not show how a section
 shares its bend. In motion the shares lag by a time constant T, which the backbone's damping gives
-(`Backbone.shape_lag_s`). So the tip is at
+(`ArmSpec.shape_lag_s`). So the tip is at
 
     even(l) + U,    T U' = rest(l) - even(l) - U,
 
@@ -75,12 +75,12 @@ def fit_shape(logs: Sequence[Log], spec: ArmSpec) -> ShapeFit | None:
         spec: arm, its sensors and chambers already calibrated.
     """
     parts = [part for log in logs for part in _parts(log, spec)]
-    if not parts or not spec.backbone.shape_lag_s:
+    if not parts or not spec.shape_lag_s:
         return None
 
     # Errors of each lag, of all parts
     square_mm2 = np.array([_squares_mm2(parts, lag_s) for lag_s in LAGS_S])  # (lags, rows)
-    rms, before_s = np.sqrt(square_mm2.mean(axis=1)), spec.backbone.shape_lag_s
+    rms, before_s = np.sqrt(square_mm2.mean(axis=1)), spec.shape_lag_s
     lag_s, blocks = float(LAGS_S[np.argmin(rms)]), _blocks(parts)
     bending = scaled(spec.backbone.bending_damping_nms_per_rad, lag_s / before_s)
     return ShapeFit(

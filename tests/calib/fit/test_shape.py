@@ -55,10 +55,10 @@ def test_a_planted_damping_comes_back(quick):
     own, planted = fit_shape([log_of(1.0)], SPEC), fit_shape([quick], SPEC)
     assert planted.lag_s == pytest.approx(0.25 * own.lag_s, rel=0.25)
     assert planted.is_better and planted.rms_mm < 0.7 * planted.before_rms_mm
-    assert planted.spec.backbone.shape_lag_s == pytest.approx(planted.lag_s)
-    assert planted.before_s == SPEC.backbone.shape_lag_s
+    assert planted.spec.shape_lag_s == pytest.approx(planted.lag_s)
+    assert planted.before_s == SPEC.shape_lag_s
     for found, factor in ((own, 1.0), (planted, 0.25)):
-        off = np.log(found.lag_s / (factor * SPEC.backbone.shape_lag_s))
+        off = np.log(found.lag_s / (factor * SPEC.shape_lag_s))
         assert abs(off) < QUANTILE * found.log_std < 0.7
 
 
@@ -111,7 +111,7 @@ def test_the_damping_fit_has_the_interval_of_the_lag_as_its_prior(quick, monkeyp
     asked = []
 
     def fit(stretches, spec, seed, prior):
-        asked.append((spec.backbone.shape_lag_s, prior))
+        asked.append((spec.shape_lag_s, prior))
         return dataclasses.replace(DAMPING, spec=spec)
 
     monkeypatch.setattr(steps, "fit_damping", fit)
