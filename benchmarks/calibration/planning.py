@@ -1,7 +1,7 @@
 """Trained policies of rods, arms of other physics, by the poses of their calibration, in the closed loop.
 
 Recordings of a rod share their first poses, which are random. The others are chosen by `calib plan` from the
-calibration by the first ones, or random. A rod's policy is trained once, by its first calibration, and
+calibration by the first ones, or random. A rod's policies are trained by its first calibration, and
 exported with each of them: no training hides what a calibration does. The commands are those of the pages;
 poses are logged at rest, without the motion to them. A log of every tick tells the regulators. Nobody tells
 the loop what a rod carries.
@@ -50,6 +50,7 @@ BELIEVED_MM, PAYLOAD_G, HALF, QUARTER_OFF = 0.5, 60.0, 0.5, 0.75  # other target
 def measure(
     rods: cli.Integers = (0, 1, 2),
     recordings: Annotated[tuple[str, ...], names_of(RECORDINGS)] = tuple(RECORDINGS),
+    seeds: cli.Integers = (0,),
     preset: str = "payload",
     steps: int = 131_072,
     points: int = 8,
@@ -60,6 +61,7 @@ def measure(
     Args:
         rods: seeds of the rod twins
         recordings: names of recordings
+        seeds: of training
         preset: of each training
         steps: environment steps of each training
         points: goals of the circle
@@ -68,8 +70,8 @@ def measure(
     xla.enable_compilation_cache()
     with tempfile.TemporaryDirectory() as folder:
         home = (keep or Path(folder)).absolute()
-        settings = preset, steps, points
-        rows = [row for seed in rods for name in recordings for row in _rows(seed, name, home, settings)]
+        runs = [(rod, name, seed) for rod in rods for name in recordings for seed in seeds]
+        rows = [row for run in runs for row in _rows(*run, home, (preset, steps, points))]
     return {"targets": targets(rows), "rods": rows}
 
 
@@ -97,9 +99,13 @@ def targets(rows: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
             unknown = max(row["unknown directions"] for row in group)
             found.append(target(f"{name}: no unknown direction", f"{unknown} at most", unknown == 0))
         grid_mm = [row["largest [mm]"] for row in group if row["goals"] == "grid"]
-        sizes[name] = {row["rod"] for row in group}, float(np.mean(off_g)), float(np.mean(grid_mm))
+        sizes[name] = (
+            {(row["rod"], row["seed"]) for row in group},
+            float(np.mean(off_g)),
+            float(np.mean(grid_mm)),
+        )
 
-    # Planned poses beside the first ones, on the same rods
+    # Planned poses beside the first ones, on the same rods and seeds
     first, then = (sizes.get(RECORDINGS[name]) for name in ("random", "planned"))
     if first and then and first[0] == then[0]:
         for text, k, share, unit in (
@@ -111,20 +117,17 @@ def targets(rows: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
     return found
 
 
-def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> list[dict[str, Any]]:
-    """Return the rows of a rod with a recording; take those from their files that are there."""
+def _rows(rod: int, name: str, seed: int, home: Path, settings: tuple[str, int, int]) -> list[dict[str, Any]]:
+    """Return the rows of a rod's policy with a recording; take those from their files that are there."""
     preset, steps, points = settings
-    folder, first = _calibrated(seed, name, home), _calibrated(seed, "random", home)
+    folder, first = _calibrated(rod, name, home), _calibrated(rod, "random", home)
 
     # Train by the first calibration, and export with this one
-    run, calibration, policy = (
-        first / f"{preset}-{steps}",
-        folder / "calibration",
-        folder / f"{preset}-{steps}.npz",
-    )
+    run = first / f"{preset}-{steps}-seed{seed}"
+    calibration, policy = folder / "calibration", folder / f"{run.name}.npz"
     if not (run / "evaluation.json").exists():
         options = ("--calibration", first / "calibration", "--learner.total-env-steps", steps)
-        anew = ("--preset", preset, *options, "--seed", 0, "--out", run)
+        anew = ("--preset", preset, *options, "--seed", seed, "--out", run)
         arguments = ("--resume", run) if (run / "config.json").exists() else anew
         run_command("train", "reach", *arguments, makes=run / "evaluation.json")
     if not policy.exists():
@@ -134,7 +137,8 @@ def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> l
     # The closed loop, on the circle with payloads and on the grid
     report = json.loads((calibration / "report.json").read_text("utf-8"))["parts"]
     shared = {
-        "rod": seed,
+        "rod": rod,
+        "seed": seed,
         "recording": RECORDINGS[name],
         "unknown directions": len(report["Chambers"]["figures"]["weak"]),
         "S2R, held out [mm]": report["Sim-to-real network"]["figures"]["test"]["translation_mean_mm"],
@@ -144,7 +148,7 @@ def _rows(seed: int, name: str, home: Path, settings: tuple[str, int, int]) -> l
         file = policy.with_name(f"{policy.stem}-{goals}-{n}-{payload_g}g.json")
         if not file.exists():
             controller = Controller.of(load_policy(policy))
-            poses, arm = read_goals(goals, controller.policy, n), RodTwin(seed, payload_kg=1e-3 * payload_g)
+            poses, arm = read_goals(goals, controller.policy, n), RodTwin(rod, payload_kg=1e-3 * payload_g)
             run_to_end = follow(arm, controller, list(poses))
             write_json(file, of_run(run_to_end, controller, poses, payload_g))
         found = json.loads(file.read_text("utf-8"))
@@ -182,9 +186,9 @@ def of_run(run: LoopRun, controller: Controller, goals: np.ndarray, payload_g: f
     }
 
 
-def _calibrated(seed: int, name: str, home: Path) -> Path:
+def _calibrated(rod: int, name: str, home: Path) -> Path:
     """Return the folder of a rod's recording and calibration; make both if they are not there."""
-    first, folder = home / f"rod{seed}-random", home / f"rod{seed}-{name}"
+    first, folder = home / f"rod{rod}-random", home / f"rod{rod}-{name}"
     calibration = folder / "calibration"
     if calibration.exists():
         return folder
@@ -194,11 +198,11 @@ def _calibrated(seed: int, name: str, home: Path) -> Path:
     if name == "random":
         # Random poses, and the way between a few
         if not poses.exists():
-            arm = RodTwin(seed, session=S2R_SESSION)
-            write_log(poses, log_at_rest(arm, random_pressures(spec, FIRST, seed)))
-        moving_kpa = random_pressures(spec, N_MOVING, seed + MOVING_SEED)
+            arm = RodTwin(rod, session=S2R_SESSION)
+            write_log(poses, log_at_rest(arm, random_pressures(spec, FIRST, rod)))
+        moving_kpa = random_pressures(spec, N_MOVING, rod + MOVING_SEED)
         record(
-            RodTwin(seed, session=S2R_SESSION),
+            RodTwin(rod, session=S2R_SESSION),
             spec,
             moving_kpa,
             transients=True,
@@ -206,14 +210,14 @@ def _calibrated(seed: int, name: str, home: Path) -> Path:
         )
     else:
         # More poses, of a plan or random
-        known, table = _calibrated(seed, "random", home) / "calibration", folder / "next.csv"
+        known, table = _calibrated(rod, "random", home) / "calibration", folder / "next.csv"
         if name == "planned":
             run_command("calib", "plan", known, "--poses", N_MORE, "--out", table, makes=table)
             more_kpa = read_plan(table, spec)
         else:
-            more_kpa = random_pressures(spec, N_MORE, seed + MORE_SEED)
+            more_kpa = random_pressures(spec, N_MORE, rod + MORE_SEED)
         logs.append(folder / "more.npz")
-        write_log(logs[-1], log_at_rest(RodTwin(seed, session=S2R_SESSION), more_kpa))
+        write_log(logs[-1], log_at_rest(RodTwin(rod, session=S2R_SESSION), more_kpa))
     run_command("calib", "run", *logs, "--out", calibration, makes=calibration / "report.json")
     return folder
 

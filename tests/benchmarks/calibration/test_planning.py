@@ -4,7 +4,7 @@ from benchmarks.calibration.planning import CIRCLE_MM, RECORDINGS, targets
 
 
 def rows(name, off_g, grid_mm, unknown):
-    shared = {"rod": 0, "recording": RECORDINGS[name], "unknown directions": unknown}
+    shared = {"rod": 0, "seed": 0, "recording": RECORDINGS[name], "unknown directions": unknown}
     circle = [
         shared
         | {"goals": "circle", "payload [g]": g, "mean [mm]": 1.4, "believed [mm]": 1.0}
