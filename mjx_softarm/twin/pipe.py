@@ -29,6 +29,7 @@ FLOOR_BELOW_M = 0.05  # height of the finger tips above a container's floor: roo
 LEDGE_M = 0.02  # distance of the left and right floors from the crossing
 END_HEIGHT_M = 0.05  # height of a side container's outer end, at the outlet, above its floor
 SHEET_M = 0.02  # thickness of floors and ends
+LEAST_WIDTH_M = 0.005  # half the width of a floor below which there is none
 
 # Contacts: friction of plastics; a time constant of three time steps (MuJoCo wants two or more); impedances
 # near 1, with which a wall yields to a load at rest by less than 1 mm.
@@ -110,8 +111,9 @@ def _walls(pipe: CrossPipe):
 def _containers(pipe: CrossPipe):
     """Yield (name, corners (k, 3) [m], colour, group) of the floors, and of the left and right outer ends."""
     at = pipe.containers()
-    width = np.sqrt(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2)  # half the floor's width
-    for side in ("left", "right"):
+    # Half the width of a side's floor. In a narrow pipe the wall itself is the floor.
+    width = np.sqrt(max(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2, 0.0))
+    for side in ("left", "right") if width > LEAST_WIDTH_M else ():
         outwards, floor_z = np.sign(at[side][0]), at[side][2] - FLOOR_BELOW_M
         for part, x, z in (
             ("floor", (pipe.radius_m + LEDGE_M, pipe.branch_m), (floor_z - SHEET_M, floor_z)),
