@@ -162,7 +162,7 @@ def _plan(
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
     arm = CalibratedArm.read(calibration)
-    recorded = load_recorded(calibration / RECORDED_FILE, arm.spec.n_chambers)
+    recorded = load_recorded(calibration / RECORDED_FILE, arm.spec)
     # Choose the poses, and tell what they are for.
     xla.enable_compilation_cache()
     found = plan(arm, recorded, poses, seed)

@@ -70,22 +70,26 @@ def save_recorded(path: Path, recorded: Recorded) -> None:
     write_sealed(path, entries, KIND)
 
 
-def load_recorded(path: Path, n_chambers: int) -> Recorded:
-    """Read the poses of a calibration.
+def load_recorded(path: Path, spec: ArmSpec) -> Recorded:
+    """Read the poses of the calibration of `spec`.
 
     Raises:
         SealedFileError: the file is missing, damaged, or of another arm.
     """
     arrays = read_sealed(path, KIND, "python -m calib run")
+    # An earlier version fitted other parameters: their covariance follows from the poses
+    known, n = f"{KIND}.covariance", len(priors(spec))
+    if known in arrays and arrays[known].shape != (n, n):
+        arrays = {name: values for name, values in arrays.items() if name != known}
     entries = Entries(arrays, str(path))
     shapes = {
-        "pressure_kpa": ((None, n_chambers),),
+        "pressure_kpa": ((None, spec.n_chambers),),
         "payload_kg": ((None,),),
         "error_mm": ((None,),),
         "scale": ((2, 3), (2, 4)),
     }
-    if f"{KIND}.covariance" in arrays:
-        shapes["covariance"] = ((None, None),)
+    if known in arrays:
+        shapes["covariance"] = ((n, n),)
     found = Recorded(**{name: entries.take(f"{KIND}.{name}", np.float64, *s) for name, s in shapes.items()})
     entries.finish(1)
     return found

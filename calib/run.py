@@ -123,7 +123,7 @@ def load_calibration(folder: Path) -> Calibration:
         (),
         s2r,
         held,
-        load_recorded(recorded, spec.n_chambers) if recorded.exists() else None,
+        load_recorded(recorded, spec) if recorded.exists() else None,
         read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {},
     )
 

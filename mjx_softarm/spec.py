@@ -34,7 +34,7 @@ from mjx_softarm.spec_tables import (
 )
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
-# Lag of a section's shape over damping by stiffness of its backbone: chambers and weight stiffen it, too.
+# Lag of a section's shape over damping by stiffness of its backbone: free chambers and weight stiffen it.
 # Of the paper's arm, simulated on the circle in 20 s.
 SHAPE_SHARE = 0.65
 MOST_RATIO = 3.0  # of a spring's length and that of its section, either way; more is a slip
@@ -126,14 +126,17 @@ class ArmSpec:
     @property
     def shape_lag_s(self) -> float:
         """Time constant with which a section's bend is shared out within it, a mean over the sections."""
-        # Bending stiffness of the backbone, and of chambers that are bonded to it (`ArmParams.bonded`)
-        backbone, chambers, c = self.backbone, self.chambers, self.structure.chambers_per_section
+        bending = np.array(self.per_section(self.backbone.bending_stiffness_nm_per_rad))
+        damping = self.per_section(self.backbone.bending_damping_nms_per_rad)
+        return float(np.mean(np.divide(damping, bending / SHAPE_SHARE + self._bonded()[1])))
+
+    def _bonded(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the stiffnesses [N/m, N m/rad] (n_sections,) of bonded chambers; see `ArmParams.bonded`."""
+        c, chambers = self.structure.chambers_per_section, self.chambers
         least = np.reshape(self.per_chamber(chambers.stiffness_n_per_m), (-1, c)).min(axis=1)
         radius_m = np.array(self.per_section(self.geometry.chamber_radius_m))
-        bonded = chambers.bonded_share * c * least * radius_m**2 / 2
-        stiffness = np.array(self.per_section(backbone.bending_stiffness_nm_per_rad)) + bonded
-        damping = self.per_section(backbone.bending_damping_nms_per_rad)
-        return SHAPE_SHARE * float(np.mean(np.divide(damping, stiffness)))
+        axial = chambers.bonded_share * c * least
+        return axial, axial * radius_m**2 / 2
 
     @property
     def section_roll_deg(self) -> tuple[float, ...]:
@@ -229,7 +232,7 @@ class ArmSpec:
                 f"chamber, or {LEAST_CHAMBERS} or more that divide the {n} chambers"
             )
 
-        # Lists have the right number of entries, lower limits are below upper ones
+        # Lists have the right number of entries
         counts = {
             "sections": structure.n_sections,
             "chambers": self.n_chambers,
@@ -237,6 +240,17 @@ class ArmSpec:
             PAIRS: self.n_chambers * self.n_springs,
         }
         check_counts(self, counts, source, "")
+
+        # A negative bond leaves the backbone some stiffness
+        backbone = self.backbone.axial_stiffness_n_per_m, self.backbone.bending_stiffness_nm_per_rad
+        for own, bonded in zip(map(self.per_section, backbone), self._bonded(), strict=True):
+            if not np.all(np.add(own, bonded) > 0.0):
+                raise SpecError(
+                    f"{source}: chambers.bonded_share: got {self.chambers.bonded_share!r}, which takes more "
+                    "stiffness than the backbone has, expected a share closer to 0"
+                )
+
+        # Lower limits are below upper ones
         for group, low, high in (
             ("chambers", "pressure_min_kpa", "pressure_max_kpa"),
             ("springs", "length_min_m", "length_max_m"),

@@ -18,9 +18,7 @@ from mjx_softarm._support.fields import (
 
 PAIRS = "pairs of chamber and spring"
 LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
-# Below, the backbones of stiff chambers would be left without stiffness; a share of 1 would leave no chamber
-# that pulls between the ends of its section.
-BONDS = -0.3, 0.95
+BONDS = -0.3, 0.95  # a bonded share of 1 would leave no chamber that pulls between the ends of its section
 # Upper bounds that no soft arm exceeds, but its number in another unit does.
 LENGTH = {"high": 2.0, "unit": "m, not mm"}
 MASS = {"high": 50.0, "unit": "kg, not g"}
@@ -75,8 +73,8 @@ class Chambers:
     """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length)).
 
     A bellows that is free between the ends of its section resists a change of its length alone. One that is
-    bonded to every ring resists the bend of each link, too: `bonded_share` of it does. A negative share makes
-    links softer, as more of them would be.
+    bonded to every ring resists the bend of each link, too: `bonded_share` of its stiffness does, of its
+    damping nothing. A negative share makes links softer, as more of them would be.
     """
 
     area_m2: PerChamber = positive(per="chambers", **AREA)

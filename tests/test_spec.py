@@ -32,6 +32,13 @@ def changed(data, path, value):
     return data
 
 
+def test_a_negative_bond_leaves_the_backbone_its_stiffness(spec):
+    assert spec.replace(chambers={"bonded_share": -0.3}).shape_lag_s > spec.shape_lag_s
+    assert spec.replace(chambers={"bonded_share": 0.5}).shape_lag_s < spec.shape_lag_s
+    stiff = {"stiffness_n_per_m": 1200.0, "bonded_share": -0.3}
+    assert "chambers.bonded_share: got -0.3, which takes more" in message_of(spec.replace, chambers=stiff)
+
+
 def test_default_is_the_paper_s_arm(spec):
     paper = {
         "structure.n_sections": 3,

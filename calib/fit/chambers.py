@@ -1,4 +1,4 @@
-"""Stiffness, area and length of each chamber, and the arm's mounting, fitted to poses of the arm at rest.
+"""Chambers, their bond to the backbone, its bending, and the mounting, fitted to poses of the arm at rest.
 
 The simulated arm settles at the logged pressures. Robust least squares (`calib.fit.leastsquares`) change its
 chambers until tip poses agree, and spring lengths and markers at the sections' ends where there are any. The

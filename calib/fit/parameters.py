@@ -5,8 +5,9 @@ Each entry is a change from the specification:
 - per chamber: logarithms of the ratios of stiffness and area; slope of the area, in areas per section length;
   rest length, in section lengths
 - backbone: logarithm of the ratio of the bending stiffness, one for all sections
-- share of the chambers that is bonded to the backbone, one for all sections. Weights show it, the arm's own
-  and a payload: they bend the links of a section unlike each other, and more where chambers are free
+- share of the chambers that is bonded to the backbone, one for all sections. It shows where the links of a
+  section bend unlike each other, by the arm's weight or a payload. It takes in other differences of the arm
+  from the model, too: it is a number of the model rather than of the bellows
 - mounting: turn of the base about its own x and y, and its offset; roll of each section's holes; turn of the
   measured tip, and its offset within the last plate. A turn of the base about its own z is a roll of all
   sections. An axial offset of the tip cannot be told from an offset of the base.
@@ -24,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -40,6 +42,7 @@ from mjx_softarm.spec_tables import BONDS, Structure
 FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")
 BENDING = "bending_stiffness_nm_per_rad"  # field of the backbone
 BOND = "bonded_share"  # field of the chambers
+FIXED = 1e-4  # prior of a parameter that stays at its start
 
 
 class Block(NamedTuple):
@@ -72,14 +75,20 @@ BLOCKS = (
 
 def priors(spec: ArmSpec) -> np.ndarray:
     """Return standard deviations (p,) about the start."""
-    return np.concatenate([np.full(_size(block, spec.structure), block.prior) for block in BLOCKS])
+    values = _of_each(spec, "prior")
+    if spec.structure.links_per_section == 1:  # no links of a section to tell a bond by
+        values[names(spec).index(BOND)] = FIXED
+    return values
 
 
 def tolerances(spec: ArmSpec) -> np.ndarray:
     """Return errors (p,) within which parameters count as known."""
-    one_link = spec.structure.links_per_section == 1  # a bond changes nothing there
-    sizes = ((block, _size(block, spec.structure)) for block in BLOCKS)
-    return np.concatenate([np.full(n, 1.0 if one_link and b.name == BOND else b.tolerance) for b, n in sizes])
+    return _of_each(spec, "tolerance")
+
+
+def _of_each(spec: ArmSpec, number: str) -> np.ndarray:
+    """Return a number of the blocks for each parameter (p,)."""
+    return np.concatenate([np.full(_size(block, spec.structure), getattr(block, number)) for block in BLOCKS])
 
 
 def names(spec: ArmSpec) -> list[str]:
@@ -147,6 +156,7 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
         spring_site_m=_rolled(params.spring_site_m, by["roll"]),
         joint_stiffness=joints.reshape(-1),
         chamber_stiffness=params.chamber_stiffness * jnp.exp(by["stiffness"]),
+        whole_stiffness=params.whole_stiffness * jnp.exp(by["stiffness"]),
         area=params.area * jnp.exp(by["area"]),
         area_slope=params.area_slope + by["slope"] * params.area / params.free_length_m,
         chamber_rest_m=params.chamber_rest_m + by["offset"] * params.free_length_m,
@@ -157,7 +167,9 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
             tip_rotation=product(jnp.asarray(mount.tip_rotation), _turned(by["tip turn"])),
         ),
     )
-    return free.bonded(jnp.clip(by[BOND][0], *BONDS))
+    # At a limit the derivative stays, or the share would count as unknown
+    share = by[BOND][0]
+    return free.bonded(share + jax.lax.stop_gradient(jnp.clip(share, *BONDS) - share))
 
 
 def free_arm(spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, ArmParams]:

@@ -163,8 +163,9 @@ class ReachEnv:
         spread = self.config.randomisation
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],
-            chamber_stiffness=self.params.chamber_stiffness
-            * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
+            chamber_stiffness=self.params.stiffened(
+                1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)
+            ).chamber_stiffness,
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
             moving=self.episode_motion.params(noise.moving),
             **self.episode_motion.at_rest(start),

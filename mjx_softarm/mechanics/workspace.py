@@ -69,7 +69,7 @@ def _loaded_solver(n_at_once: int | None, by_law: bool = False):
     def solve(
         params: ArmParams, pressure_kpa: Array, load_kg: Array, stiffness: Array, area: Array
     ) -> Settled:
-        own = params._replace(chamber_stiffness=params.chamber_stiffness * stiffness, area=params.area * area)
+        own = params.stiffened(stiffness)._replace(area=params.area * area)
         loaded = own._replace(tool_mass_kg=jnp.asarray(own.tool_mass_kg).at[PAYLOAD].set(load_kg))
         kinematics = chain_kinematics(own)
         if not by_law:

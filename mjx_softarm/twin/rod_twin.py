@@ -1,10 +1,11 @@
 """The rod twin: an arm with other physics than training's, behind the same `ArmIO` as `Twin`.
 
-The arm is a rod of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints. Each
-chamber hardens by a law of its own, and its effective area grows with pressure. The base is tilted, the
-sections are rolled against each other, and motion capture's frame of the tip is turned against the last plate
-and offset from its centre. Its chambers have regulators, whatever the specification has. There is no
-hysteresis and no inertia. Readings, noise and clock are those of `Twin`. Parts are drawn from the seed.
+The arm is a rod of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints. Chambers
+are glued to it, whatever `bonded_share` the specification has. Each chamber hardens by a law of its own,
+and its effective area grows with pressure. The base is tilted, the sections are rolled against each other,
+and motion capture's frame of the tip is turned against the last plate and offset from its centre. Its
+chambers have regulators, whatever the specification has. There is no hysteresis and no inertia. Readings,
+noise and clock are those of `Twin`. Parts are drawn from the seed.
 
 The gap is that of `Twin`, and the tolerances for base, roll and springs are the same. At the spring lengths
 that bring training's model to the paper's circle, the tips of rods 100 to 105, which no experiment uses, are

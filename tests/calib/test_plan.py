@@ -90,7 +90,7 @@ def test_markers_of_the_calibration_count_for_the_plan_too(recorded, tmp_path):
     """Markers that are known ten times as well as the tip tell more than tip and springs alone."""
     with_markers = recorded._replace(scale=np.tile([1e-3, 0.01, 1e-3, 1e-4], (2, 1)))
     save_recorded(tmp_path / RECORDED_FILE, with_markers)
-    loaded = load_recorded(tmp_path / RECORDED_FILE, 3)
+    loaded = load_recorded(tmp_path / RECORDED_FILE, SMALL)
     np.testing.assert_array_equal(loaded.scale, with_markers.scale)
     unknown = [plan(CalibratedArm(SMALL), known, 30, seed=0).n_unknown for known in (recorded, loaded)]
     assert unknown[1][0] < unknown[0][0] and unknown[1][1] < unknown[0][1]
@@ -114,7 +114,15 @@ def test_from_a_calibration_to_a_file_that_record_reads(recorded, tmp_path, caps
     assert main(["plan", str(tmp_path), "--out", str(out)]) == 2
     assert "expected a new file" in capsys.readouterr().err
     with pytest.raises(SealedFileError, match="recorded.pressure_kpa: got float64"):
-        load_recorded(tmp_path / RECORDED_FILE, 9)
+        load_recorded(tmp_path / RECORDED_FILE, ArmSpec.default())
+
+
+def test_the_covariance_of_other_parameters_is_left_out(recorded, tmp_path):
+    """An earlier version had fewer; a plan then takes that of its poses."""
+    save_recorded(tmp_path / RECORDED_FILE, recorded._replace(covariance=np.eye(3)))
+    loaded = load_recorded(tmp_path / RECORDED_FILE, SMALL)
+    assert loaded.covariance is None
+    assert plan(CalibratedArm(SMALL), loaded, 5, seed=0).pressure_kpa.shape == (5, 3)
 
 
 def test_pressures_beyond_the_limits_or_of_another_arm_are_refused(tmp_path):

@@ -125,6 +125,10 @@ def test_bonded_chambers_resist_links_that_bend_unlike_each_other_and_no_others(
         pulls = [_statics(x, pressure_kpa, p)[0].gradient for p in of for x in (q, 0 * q)]
         return float(q @ (pulls[2] - pulls[3]) - q @ (pulls[0] - pulls[1])), float(q @ (pulls[0] - pulls[1]))
 
+    at_rest = [
+        _statics(np.zeros(36, np.float32), pressure_kpa, ArmParams.from_spec(s))[0] for s in (free, bonded)
+    ]
+    np.testing.assert_allclose(at_rest[1].gradient, at_rest[0].gradient, atol=1e-4)  # by the rest lengths
     alike, size = change(section)
     assert abs(alike) < 0.01 * size
     least = np.reshape(free.chambers.stiffness_n_per_m, (3, 3)).min(axis=1)

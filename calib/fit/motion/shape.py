@@ -1,7 +1,7 @@
 """Lag of an arm's shape behind its spring lengths, fitted to springs and tip of the moving arm.
 
 At rest a section does not bend evenly: weight bends its upper part more. Springs do not show how a section
-shares its bend. In motion the shares lag by a time constant T, which the backbone's damping gives
+shares its bend. In motion the shares lag by a time constant T, which the damping of the bend gives
 (`ArmSpec.shape_lag_s`). So the tip is at
 
     even(l) + U,    T U' = rest(l) - even(l) - U,
