@@ -126,7 +126,7 @@ def test_markers_at_the_sections_ends_tell_the_offsets_wherever_they_are_stuck(f
     assert fit.has_markers and not fitted_without_springs.has_markers
     assert fit.direction_widths[0] < 0.5 * fitted_without_springs.direction_widths[0]
     assert len(fit.weak) < len(fitted_without_springs.weak)
-    # Of offsets up to 5 mm. Without springs they are worth less than with them, and the bond is one number more.
+    # Of offsets up to 5 mm: without springs they are known less well, and the bond is one number more
     assert off_by(fit.spec, planted())[3] < 2.5e-3
     assert fit.spec.chambers.bonded_share == pytest.approx(0.0, abs=0.05)
     assert fit.scale[0, 3] == pytest.approx(TIP_NOISE_M, rel=0.2)
