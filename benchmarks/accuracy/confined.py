@@ -224,14 +224,20 @@ def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def force_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the largest force of each run, by case: filled where all operations were done."""
     cases = list(dict.fromkeys(row["case"] for row in rows))
-    figure = Figure(figsize=(8.0, 0.5 * len(cases) + 1.4), layout="constrained")
+    runs = list(dict.fromkeys((row["twin"], row["seed"]) for row in rows))
+    figure = Figure(figsize=(8.0, 0.9 * len(cases) + 1.4), layout="constrained")
     axes = figure.subplots()
     for row in rows:
         shown = row["objects"] == VARIANTS[0]
         done, colour = row["done"] == N_OPERATIONS, "tab:blue" if shown else "tab:orange"
-        y = cases.index(row["case"]) + (-0.15 if shown else 0.15)
+        # Runs stand below each other, so that none hides another
+        y = (
+            cases.index(row["case"])
+            - (0.4 if shown else -0.05)
+            + 0.4 * runs.index((row["twin"], row["seed"])) / len(runs)
+        )
         face = colour if done else "none"
-        axes.scatter(max(row["wall_max_n"], 0.1), y, s=36, edgecolors=colour, facecolors=face, zorder=2)
+        axes.scatter(max(row["wall_max_n"], 0.1), y, s=20, edgecolors=colour, facecolors=face, zorder=2)
     axes.axvline(CALM_N, color="0.6", linewidth=1, zorder=1)
     axes.set(xscale="log", xlabel="largest force of the wall [N]; no more than 0.1 N: at the left edge")
     axes.set(yticks=range(len(cases)), yticklabels=cases, ylim=(len(cases) - 0.5, -0.5))
