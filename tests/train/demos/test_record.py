@@ -100,15 +100,18 @@ def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, 
     assert result.ending.status == 0 and result.off_m.max() < CLOSE_M
 
 
-def test_best_pose_is_logged_where_corrections_find_no_rest(expert, waypoints, plan, shift_mm):
-    """The first pose is off by the shift; after it the expert asks for springs that no pressure makes."""
+@pytest.mark.parametrize("spring_mm, up_mm", [(60.0, 0.0), (0.0, 2.0)], ids=["no rest", "farther off"])
+def test_best_pose_is_logged_where_corrections_are_worse(expert, waypoints, plan, shift_mm, spring_mm, up_mm):
+    """The first pose is off by the shift; then impossible springs are asked for, or a wrong place."""
 
     class Worse:
-        spec, target = expert.spec, expert.target
+        spec, target, up_m = expert.spec, expert.target, 1e-3 * up_mm
 
         def reach(self, name, target, before_kpa):
-            found = expert.reach(name, target, before_kpa)
-            return found._replace(spring_m=found.spring_m + 0.06 * (np.arange(9) == 4))
+            self.up_m *= 3  # or the recorder would correct it
+            wrong = target._replace(finger_m=target.finger_m + [0.0, 0.0, self.up_m])
+            found = expert.reach(name, wrong, before_kpa)
+            return found._replace(spring_m=found.spring_m + 1e-3 * spring_mm * (np.arange(9) == 4))
 
     result = WaypointRecorder(IdealArm(), Worse()).record(waypoints[:1], plan)
     assert result.ending.status == 0
