@@ -31,7 +31,8 @@ float64, networks and the workspace float32.
 
 The arm's numbers stand beside `spec_json` because the actor was trained with them: a later version may derive
 others from the same specification. A new entry, or a new field of a class named here (`ArmSpec` included),
-makes a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused: its run is exported again.
+makes a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused: its run is exported again. A
+field of `ArmSpec` whose default leaves arms as they were makes none, and older files are read.
 """
 
 from __future__ import annotations
