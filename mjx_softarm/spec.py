@@ -31,6 +31,7 @@ from mjx_softarm.spec_tables import (
     Springs,
     Structure,
     Unmodelled,
+    bonded_stiffness,
 )
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
@@ -131,12 +132,11 @@ class ArmSpec:
         return float(np.mean(np.divide(damping, bending / SHAPE_SHARE + self._bonded()[1])))
 
     def _bonded(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the stiffnesses [N/m, N m/rad] (n_sections,) of bonded chambers; see `ArmParams.bonded`."""
-        c, chambers = self.structure.chambers_per_section, self.chambers
-        least = np.reshape(self.per_chamber(chambers.stiffness_n_per_m), (-1, c)).min(axis=1)
-        radius_m = np.array(self.per_section(self.geometry.chamber_radius_m))
-        axial = chambers.bonded_share * c * least
-        return axial, axial * radius_m**2 / 2
+        """Return the stiffnesses [N/m, N m/rad] (n_sections,) of bonded chambers."""
+        stiffness = self.per_chamber(self.chambers.stiffness_n_per_m)
+        each = np.reshape(stiffness, (-1, self.structure.chambers_per_section))
+        square_m2 = np.square(self.per_section(self.geometry.chamber_radius_m))
+        return bonded_stiffness(self.chambers.bonded_share, each, square_m2)[1:]
 
     @property
     def section_roll_deg(self) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ from mjx_softarm._support.fields import (
     share,
     vector,
 )
+from mjx_softarm._support.xp import Array
 
 PAIRS = "pairs of chamber and spring"
 LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
@@ -85,6 +86,24 @@ class Chambers:
     pressure_min_kpa: float = anything(low=-101.325, **PRESSURE)
     pressure_max_kpa: float = anything(low=-101.325, **PRESSURE)
     bonded_share: float = share(*BONDS)
+
+
+def bonded_stiffness(share: Array, stiffness: Array, square_m2: Array) -> tuple[Array, Array, Array]:
+    """Return what the bonded chambers of each section are worth (n_sections,).
+
+    Each chamber of a section gives its links the same stiffness, a share of that of the least stiff one.
+
+    Args:
+        share: bonded share.
+        stiffness (n_sections, c) [N/m]: stiffnesses of the chambers.
+        square_m2 (n_sections,) [m^2]: mean square of their distances from the section's axis.
+
+    Returns:
+        Stiffness [N/m] that each chamber gives; axial [N/m] and bending stiffness [N m/rad] of a section.
+    """
+    given = share * stiffness.min(axis=1)
+    axial = stiffness.shape[1] * given
+    return given, axial, axial * square_m2 / 2
 
 
 @dataclass(frozen=True)

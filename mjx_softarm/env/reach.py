@@ -161,11 +161,10 @@ class ReachEnv:
         start = jax.tree.map(lambda x: x[start_row], pool)
         goal = pool.pose[goal_row]
         spread = self.config.randomisation
+        factor = 1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],
-            chamber_stiffness=self.params.stiffened(
-                1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)
-            ).chamber_stiffness,
+            chamber_stiffness=self.params.stiffened(factor).chamber_stiffness,
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
             moving=self.episode_motion.params(noise.moving),
             **self.episode_motion.at_rest(start),

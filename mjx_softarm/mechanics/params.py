@@ -17,7 +17,7 @@ from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import LEAST_CHAMBERS
+from mjx_softarm.spec_tables import LEAST_CHAMBERS, bonded_stiffness
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
@@ -105,7 +105,6 @@ class ArmParams(NamedTuple):
     def bonded(self, share: Array | np.ndarray) -> ArmParams:
         """Return this arm of free chambers with a share of them bonded.
 
-        Each chamber of a section gives its links the same stiffness, a share of that of the least stiff one.
         To first order in bends and stretches, links that are alike are as stiff as before. Joints are linear
         and tendons are not: links of the paper's arm that are bent by 0.1 rad and stretched by 10 mm push
         back by 9 % more with a share of 0.9.
@@ -113,13 +112,12 @@ class ArmParams(NamedTuple):
         # Stiffness that each chamber of a section gives
         xp, (n_sections, c, _) = array_namespace(self.chamber_stiffness), self.chamber_site_m.shape
         stiffness, free_m = self.chamber_stiffness.reshape(n_sections, c), self.free_length_m
-        given = share * xp.min(stiffness, axis=1)  # (n_sections,)
+        square_m2 = xp.mean(xp.sum(self.chamber_site_m**2, axis=-1), axis=1)
+        given, axial, bend = bonded_stiffness(share, stiffness, square_m2)  # (n_sections,) each
         left = (stiffness - given[:, None]).reshape(-1)
         # Joints that take it: stretching, and bending about x and y
         per_section = self.link_length_m.shape[0] // n_sections
-        square_m2 = xp.mean(xp.sum(self.chamber_site_m**2, axis=-1), axis=1)
-        bend = given * square_m2 / 2
-        joints = c * per_section * xp.stack([given, bend, bend], axis=-1)
+        joints = per_section * xp.stack([axial, bend, bend], axis=-1)
         joints = xp.broadcast_to(joints[:, None], (n_sections, per_section, 3)).reshape(-1)
         return self._replace(
             chamber_stiffness=left,
