@@ -23,11 +23,11 @@ from calib.fit.motion.actuators import fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
-from calib.fit.payload import payload_poses, told_widths
+from calib.fit.payload import payload_poses, told_widths, weighed
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
-from calib.read.static_poses import StaticPoses
+from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import motion, sections
 from calib.report.changes import CHANGES, changes_section
 from calib.report.page import Section
@@ -164,20 +164,22 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     # Give a pose that was not held out the mean error of the held-out poses.
     error_mm = np.full(poses.n, fit.test.translation_mean_mm)
     error_mm[used[fit.held_out]] = pairs["with the network"].error_mm[fit.held_out]
-    # Fit the pressures that hold the arm.
-    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
     extras = Extras(pairs=pairs, error_mm=error_mm)
     if fit.is_better:
         extras["s2r"] = fit.s2r
+    # Fit the pressures that hold the arm.
+    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
     if not held.is_better:
         return StepResult(spec, section, extras)
-    extras["held"] = held.held
     spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
+    arm = CalibratedArm(spec, extras.get("s2r"), held.held)
+    known, n_weighed = weighed(arm, held.held, poses)
+    extras["held"] = known
+    # Say how well they tell payloads.
     largest_kg = spec.mass.largest_payload_kg
-    at = payload_poses(CalibratedArm(spec, extras.get("s2r")))
-    widths_kg = told_widths(held.held, at, largest_kg)
+    widths_kg = told_widths(known, payload_poses(arm._replace(held=known)), largest_kg)
     section = sections.with_pressures(section, held, widths_kg, LOOP.load_known * largest_kg)
-    return StepResult(spec, section, extras)
+    return StepResult(spec, sections.with_factor(section, known, n_weighed), extras)
 
 
 def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
@@ -208,7 +210,7 @@ STEPS: Mapping[str, Step] = MappingProxyType(
 
 def _unloaded(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
     """Return the indices of the poses with spring lengths and no more than the specification's payload."""
-    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
+    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=SAME_KG)
     return np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
 
 

@@ -131,7 +131,8 @@ def make_arm_model():
         plane = np.float32(0.1 * rng.normal(size=(n, n_out))), *scaling, row(-4.0, n_out), row(1.0, n_out)
         known = np.float32(np.tile(np.eye(blocks[1]), (n_sections, 1, 1)))
         hysteresis = row(0.7, spec.n_chambers), row(0.01, spec.n_chambers)
-        load = LoadEstimator(layers(n, 4, n_out), *plane, known, 0.1 * known, *hysteresis, *kg)
+        held = known, 0.1 * known, *hysteresis, *kg, np.float32(0.05)
+        load = LoadEstimator(layers(n, 4, n_out), *plane, *held)
         springs = SpringModel(layers(spec.n_chambers, 5, n), *kpa, *scaling)
         poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
         n_in = N_POSE_INPUTS + n

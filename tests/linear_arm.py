@@ -13,7 +13,7 @@ from mjx_softarm.mdp.observation import ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, estimate
-from mjx_softarm.sensing.load import LoadEstimator
+from mjx_softarm.sensing.load import COMMON_FACTOR, LoadEstimator
 
 SPEC = ArmSpec.default()
 N, DT_S = SPEC.n_chambers, 1.0 / SPEC.control.rate_hz
@@ -117,6 +117,7 @@ def load_estimator_of(spec, effect_kpa_per_kg, sd_kg=0.05):
         "stroke_m": np.ones(spec.n_chambers),
         "own_load_kg": 0.0,
         "load_scale_kg": 1.0,
+        "factor_sd": COMMON_FACTOR,
     }
     layers = ((np.zeros((n, n_out), np.float32), np.zeros(n_out, np.float32)),)
     return LoadEstimator(layers, **{name: np.float32(value) for name, value in fields.items()})

@@ -40,11 +40,17 @@ from mjx_softarm.twin.rod_twin import RodTwin
 
 N_FRAMES = 50  # averaged frames of a logged pose: a second
 FIRST, MORE_SEED, MOVING_SEED = 500, 1_000, 2_000  # random poses of all; seeds of other poses, plus the rod's
-RECORDINGS = {"random": "500 random", "planned": "500 random, 200 planned", "more": "700 random"}
+WEIGHT_G, N_WEIGHED = 500, 20  # known weight, and number of poses with it
+RECORDINGS = {
+    "random": "500 random",
+    "planned": "500 random, 200 planned",
+    "more": "700 random",
+    "weighed": f"500 random, {N_WEIGHED} with {WEIGHT_G} g",
+}
 N_MORE = 200
 GRID_POINTS = 60  # goals of the grid, at most; 20 leave four on the rods
 CIRCLE_MM = {0: 1.5, 500: 1.5, 1000: 2.0}  # targets by payload [g]: mean error on the circle
-BELIEVED_MM, PAYLOAD_G, HALF, QUARTER_OFF = 0.5, 60.0, 0.5, 0.75  # other targets
+BELIEVED_MM, PAYLOAD_G, WEIGHED_G, HALF, QUARTER_OFF = 0.5, 60.0, 35.0, 0.5, 0.75  # other targets
 
 
 def measure(
@@ -98,6 +104,9 @@ def targets(rows: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
             found.append(target(text, f"{max(off_g):.0f} g at most", max(off_g) <= PAYLOAD_G))
             unknown = max(row["unknown directions"] for row in group)
             found.append(target(f"{name}: no unknown direction", f"{unknown} at most", unknown == 0))
+        if name == RECORDINGS["weighed"]:
+            text = f"{name}: payload within {WEIGHED_G:g} g"
+            found.append(target(text, f"{max(off_g):.0f} g at most", max(off_g) <= WEIGHED_G))
         grid_mm = [row["largest [mm]"] for row in group if row["goals"] == "grid"]
         sizes[name] = (
             {(row["rod"], row["seed"]) for row in group},
@@ -209,21 +218,26 @@ def _calibrated(rod: int, name: str, home: Path) -> Path:
             save=lambda log: write_log(logs[1], log),
         )
     else:
-        # More poses, of a plan or random
+        # More poses, of a plan or random, or with a known weight
         known, table = _calibrated(rod, "random", home) / "calibration", folder / "next.csv"
         if name == "planned":
             run_command("calib", "plan", known, "--poses", N_MORE, "--out", table, makes=table)
             more_kpa = read_plan(table, spec)
         else:
-            more_kpa = random_pressures(spec, N_MORE, rod + MORE_SEED)
+            more_kpa = random_pressures(spec, N_MORE if name == "more" else N_WEIGHED, rod + MORE_SEED)
+        payload_kg = 1e-3 * WEIGHT_G if name == "weighed" else 0.0
         logs.append(folder / "more.npz")
-        write_log(logs[-1], log_at_rest(RodTwin(rod, session=S2R_SESSION), more_kpa))
+        write_log(logs[-1], log_at_rest(RodTwin(rod, session=S2R_SESSION), more_kpa, payload_kg))
     run_command("calib", "run", *logs, "--out", calibration, makes=calibration / "report.json")
     return folder
 
 
-def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
-    """Return a log of an arm at rest at pressures (n, n_chambers), each row the mean of a second."""
+def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray, payload_kg: float = 0.0) -> Log:
+    """Return a log of an arm at rest at pressures (n, n_chambers), each row the mean of a second.
+
+    A payload is hung at the arm.
+    """
+    arm.attach(payload_kg)
     rows: list[dict[str, np.ndarray]] = []
     for pressure in pressure_kpa:
         arm.settle(pressure)
@@ -242,5 +256,5 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
         )
     n = len(pressure_kpa)
     columns: Any = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    kg = np.zeros(n)
+    kg = np.full(n, payload_kg)
     return Log(source="rod", row=np.arange(n) + 2, time_s=5.0 * np.arange(n), payload_kg=kg, **columns)

@@ -25,6 +25,7 @@ from mjx_softarm.sensing.sensors import SensorFault
 from mjx_softarm.spec import ArmSpec
 
 POSE_COLUMNS = ("pressure_kpa", "tip_m", "tip_quaternion")  # needed in a log of poses
+SAME_KG = 1e-6  # difference of payloads that count as the same
 
 
 class StaticPoses(NamedTuple):

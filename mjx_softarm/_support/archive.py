@@ -139,6 +139,9 @@ class Entries:
     def __init__(self, arrays: Mapping[str, np.ndarray], source: str):
         self._source, self._arrays, self._left = source, arrays, set(arrays)
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._arrays
+
     def fail(self, name: str, problem: str) -> NoReturn:
         raise SealedFileError(f"{self._source}: {name}: {problem}")
 

@@ -61,7 +61,7 @@ from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 from mjx_softarm.spec_tables import Mounting
 
-SCHEMA_VERSION = 14
+SCHEMA_VERSION = 15
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it

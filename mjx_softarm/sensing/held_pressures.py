@@ -15,7 +15,8 @@ corrects them. Its variance tells how well a payload is known: it is large far f
 
 A payload changes a chamber's pressure by the simulated change times a factor. The log of an unloaded arm does
 not show this factor: with all stiffnesses, areas and masses greater by the same share, the log is the same.
-So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`.
+So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`. Poses with
+a known weight tell the mean of all chambers (`calib.fit.payload.weighed`).
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
@@ -47,6 +48,9 @@ class HeldPressures(NamedTuple):
     covariance_kpa2: np.ndarray  # (s, c, c) V
     hysteresis_kpa: np.ndarray  # (s,) largest pressure of a chamber's hysteresis
     stroke_m: np.ndarray  # (s,) stroke of its stop operator
+    # Change by a payload over the simulated one, mean of all chambers, and its relative standard deviation.
+    factor: float = 1.0
+    factor_sd: float = COMMON_FACTOR
 
 
 class Residual(NamedTuple):
@@ -56,9 +60,9 @@ class Residual(NamedTuple):
     share: np.ndarray  # (m, s) variance, noise included, as a multiple of V
 
 
-def factor_covariance(n: int) -> np.ndarray:
-    """Return the covariance (n, n) of the factors by which n chambers answer to a payload at a pose."""
-    return COMMON_FACTOR**2 + OWN_FACTOR**2 * np.eye(n)
+def factor_covariance(held: HeldPressures, n: int) -> np.ndarray:
+    """Return the covariance (n, n) of the factors of n chambers at a pose, over their mean `factor`."""
+    return held.factor_sd**2 + OWN_FACTOR**2 * np.eye(n)
 
 
 def held_kpa(
@@ -74,17 +78,17 @@ def held_kpa(
         held: process of the arm.
         spring_m (m, n_springs) [m]: spring lengths.
         light_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm there without a payload.
-        effect_kpa (m, n_chambers) [kPa]: change of these pressures by the arm's payload.
+        effect_kpa (m, n_chambers) [kPa]: simulated change of these pressures by the arm's payload.
         rng: generator of residuals and factors for each arm; without one, means are returned.
     """
     found = residual(held, spring_m, light_kpa)
-    left_kpa, factor = found.mean_kpa, 1.0
+    left_kpa, factor = found.mean_kpa, np.ones_like(light_kpa)
     if rng is not None:
         root, (m, n) = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
         normal = rng.standard_normal(left_kpa.shape)
         left_kpa = left_kpa + np.sqrt(found.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
-        factor = rng.multivariate_normal(np.ones(n), factor_covariance(n), m)
-    return light_kpa + left_kpa.reshape(light_kpa.shape) + factor * effect_kpa
+        factor = rng.multivariate_normal(np.ones(n), factor_covariance(held, n), m)
+    return light_kpa + left_kpa.reshape(light_kpa.shape) + held.factor * factor * effect_kpa
 
 
 def sections_of(spring_m: np.ndarray, pressure_kpa: np.ndarray, n_sections: int) -> np.ndarray:
@@ -159,6 +163,8 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
         "hysteresis_kpa": (s,),
         "stroke_m": (s,),
     }
+    if f"{KIND}.factor" in entries:  # calibrations of before have none
+        shapes |= {"factor": (), "factor_sd": ()}
     arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
     held = HeldPressures(**arrays)
     if len(held.state) != len(held.residual_kpa):

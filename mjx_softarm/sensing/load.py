@@ -40,8 +40,8 @@ QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
 # Payloads in the network's data, as shares of the largest one: an interval outside holds no payload.
 LOWEST, HIGHEST = -0.5, 1.5
 # Standard deviations of the factors by which the simulated change is off: of all chambers together, by
-# masses and areas that are off by some per cent; of each chamber at each pose. A little more than on rods 100
-# to 104, which no experiment uses: 0.04 and 0.08.
+# masses and areas that are off by some per cent, where no known weight has told it; of each chamber at each
+# pose. A little more than on rods 100 to 104, which no experiment uses: 0.04 and 0.08.
 COMMON_FACTOR, OWN_FACTOR = 0.05, 0.09
 N_PASSES = 2  # number of estimates; each takes D of the last
 
@@ -65,6 +65,7 @@ class LoadEstimator(NamedTuple):
     stroke_m: Array  # (n_chambers,) [m] stroke of its stop operator
     own_load_kg: Array  # () payload of the specification, on top of which m is
     load_scale_kg: Array  # () largest payload of the arm
+    factor_sd: Array  # () standard deviation of f', see `COMMON_FACTOR`
 
 
 class Holding(NamedTuple):
@@ -138,7 +139,7 @@ def estimate_load(
         weight = _solved(known + (kg**2)[..., None, None, None] * own, effect)
         variance = 1.0 / xp.sum(weight * effect, axis=(-2, -1))
         kg = variance * xp.sum(weight * left_kpa, axis=(-2, -1))
-    return estimator.own_load_kg + kg, QUANTILE * xp.sqrt(variance + (COMMON_FACTOR * kg) ** 2)
+    return estimator.own_load_kg + kg, QUANTILE * xp.sqrt(variance + (estimator.factor_sd * kg) ** 2)
 
 
 def _solved(matrix: Array, right: Array) -> Array:
@@ -195,4 +196,5 @@ def take_load_estimator(
         stroke_m=(n_chambers,),
         own_load_kg=(),
         load_scale_kg=(),
+        factor_sd=(),
     )

@@ -17,11 +17,12 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.__main__ import check_file, tell
+from mjx_softarm.deploy.__main__ import tell
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.driven import Arm, Driven, finish
 from mjx_softarm.deploy.drivers.same_arm import check_arm
 from mjx_softarm.deploy.ending import save_log
+from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import TABLES
 from mjx_softarm.policy.file import SHIPPED, SHIPPED_TWIN, load_policy
 from mjx_softarm.spec import ArmSpec

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.__main__ import check_file
+from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import log_table, write_log
 from tests.linear_arm import GOALS, LinearArm, go
 

@@ -7,7 +7,6 @@ import pytest
 from scipy.linalg import block_diag
 
 from mjx_softarm.sensing.load import (
-    COMMON_FACTOR,
     JUMP,
     N_AVERAGED,
     N_PASSES,
@@ -31,7 +30,7 @@ def estimator_of(rng, error=0.3, dtype=np.float32):
     plane = rng.normal(size=(N, n_out)), np.full(N, 0.2), np.full(N, 0.05), centre, scale
     known = half @ half.swapaxes(1, 2) + 0.5 * np.eye(3)
     hysteresis = rng.uniform(0.5, 1.0, N), np.full(N, 0.01)
-    numbers = layers, *plane, known, np.tile(error * np.eye(3), (3, 1, 1)), *hysteresis, 0.2, 0.8
+    numbers = layers, *plane, known, np.tile(error * np.eye(3), (3, 1, 1)), *hysteresis, 0.2, 0.8, 0.04
     return LoadEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), numbers))
 
 
@@ -54,12 +53,12 @@ def test_estimate_is_generalised_least_squares_with_all_covariances():
         blocks = np.exp(found.log_share[k])[:, None, None] * estimator.covariance_kpa2 + estimator.error_kpa2
         kg, variance = 0.0, 0.0
         for _ in range(N_PASSES):
-            factors = COMMON_FACTOR**2 + OWN_FACTOR**2 * np.eye(N)
+            factors = estimator.factor_sd**2 + OWN_FACTOR**2 * np.eye(N)
             covariance = block_diag(*blocks) + kg**2 * factors * np.outer(effect[k], effect[k])
             weight = np.linalg.solve(covariance, effect[k])
             variance = 1.0 / (weight @ effect[k])
             kg, before_kg = variance * weight @ (pressure_kpa[k] - held_kpa[k]), kg
-        variance += COMMON_FACTOR**2 * (kg**2 - before_kg**2)  # the last estimate's own
+        variance += estimator.factor_sd**2 * (kg**2 - before_kg**2)  # the last estimate's own
         assert told_kg[k] == pytest.approx(0.2 + kg, rel=1e-4)
         assert half_width_kg[k] == pytest.approx(1.96 * np.sqrt(variance), rel=1e-4)
 

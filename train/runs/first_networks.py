@@ -12,7 +12,7 @@ from mjx_softarm._support.training import initial_layers
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import LoadedPool, Pool
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
-from mjx_softarm.sensing.load import LoadEstimator
+from mjx_softarm.sensing.load import COMMON_FACTOR, LoadEstimator
 from mjx_softarm.spec import ArmSpec
 
 WIDTH = 128  # width of the hidden layers
@@ -73,6 +73,7 @@ def first_load_estimator(
         stroke_m=jnp.asarray(at_chambers(1.0 if held is None else tuple(held.stroke_m))),
         own_load_kg=jnp.asarray(own_kg),
         load_scale_kg=jnp.asarray(own_kg + arm.spec.mass.largest_payload_kg),
+        factor_sd=jnp.asarray(COMMON_FACTOR if held is None else held.factor_sd),
     )
 
 

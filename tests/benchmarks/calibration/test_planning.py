@@ -25,3 +25,8 @@ def test_planned_poses_are_judged_beside_random_ones_of_the_same_rods():
     assert (grid["measured"], grid["verdict"]) == ("from 8 to 7 mm", "NOT MET")
     other_rod = [row | {"rod": 1} for row in rows("planned", 55, 7.0, 0)]
     assert len(targets(rows("random", 120, 8.0, 4) + other_rod)) == len(both) - 2
+
+
+def test_poses_with_a_known_weight_are_judged_by_the_payload():
+    verdicts = [targets(rows("weighed", off_g, 8.0, 4))[-1]["verdict"] for off_g in (30, 40)]
+    assert verdicts == ["met", "NOT MET"]

@@ -1,10 +1,15 @@
-"""Effects of payloads: an arm whose base is tilted, where S2R alone knows of it."""
+"""Effects of payloads: a tilt that S2R alone knows, and the factor that a known weight tells."""
 
 import numpy as np
+import pytest
 
 from calib.arm import CalibratedArm
-from calib.fit.payload import held_at
+from calib.fit.held_pressures import fit_held_pressures, hysteresis_kpa
+from calib.fit.payload import LEFT_FACTOR, MIN_WEIGHED, held_at, payload_poses, told_payload, weighed
+from calib.read.static_poses import StaticPoses
 from mjx_softarm import ArmSpec
+from mjx_softarm.sensing.held_pressures import held_kpa
+from mjx_softarm.sensing.load import COMMON_FACTOR
 from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
 from tests.networks import s2r_of
@@ -34,3 +39,46 @@ def test_a_tilt_that_s2r_knows_changes_the_effect_of_a_payload():
     # A tilted arm also bends in another way under its own weight. The network above leaves this out.
     assert off.mean() > 1.0 and left.mean() < 0.2 * off.mean()
     np.testing.assert_array_equal(found.pressure_kpa, without.pressure_kpa)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """An arm with small residual pressures and some hysteresis."""
+    at = payload_poses(CalibratedArm(SPEC), 60)
+    left_kpa = 0.1 * np.random.default_rng(0).standard_normal(at.pressure_kpa.shape)
+    fit = fit_held_pressures(SPEC, at.spring_m, at.pressure_kpa + left_kpa, at.pressure_kpa)
+    return CalibratedArm(SPEC, held=fit.held._replace(hysteresis_kpa=np.full(3, 0.5)))
+
+
+def poses_with(arm, factor, weight_kg, n, seed):
+    """Poses with a weight, of an arm whose chambers answer to it by this factor."""
+    at = payload_poses(arm, n, seed)
+    true, effect_kpa = arm.held._replace(factor=factor, factor_sd=0.0), weight_kg * at.effect_kpa_per_kg
+    kpa = held_kpa(true, at.spring_m, at.pressure_kpa, effect_kpa, np.random.default_rng(seed))
+    kpa = kpa + hysteresis_kpa(SPEC, arm.held, at.spring_m)
+    m, none = len(kpa), np.empty(0)
+    return StaticPoses(kpa, np.full(m, weight_kg), none, none, at.spring_m, none, none, np.ones(m))
+
+
+def test_poses_with_a_known_weight_tell_the_factor_of_all_payloads(arm):
+    held, n = weighed(arm, arm.held, poses_with(arm, 0.9, 0.5, 20, 3))
+    assert n > 15 and held.factor == pytest.approx(0.9, abs=0.02)
+    assert LEFT_FACTOR < held.factor_sd < COMMON_FACTOR
+    # Another payload at other poses, told within intervals that are narrower
+    poses = poses_with(arm, 0.9, 1.0, 40, 4)
+    kpa = poses.pressure_kpa - hysteresis_kpa(SPEC, arm.held, poses.spring_m)
+    before, then = (told_payload(arm._replace(held=x), poses.spring_m, kpa) for x in (arm.held, held))
+    assert before[0].mean() == pytest.approx(0.9, abs=0.03)
+    assert then[0].mean() == pytest.approx(1.0, abs=0.03) and then[1].mean() < before[1].mean()
+
+
+def test_a_weight_that_is_hardly_felt_tells_little(arm):
+    held, _ = weighed(arm, arm.held, poses_with(arm, 0.9, 0.005, 20, 3))
+    assert held.factor > 0.95 and held.factor_sd > 0.8 * COMMON_FACTOR
+
+
+@pytest.mark.parametrize(("weight_kg", "n_used"), [(0.5, MIN_WEIGHED - 2), (0.0, 0)])
+def test_few_poses_or_none_with_a_weight_tell_nothing(arm, weight_kg, n_used):
+    poses = poses_with(arm, 0.9, weight_kg, 20, 3)
+    poses.spring_m[MIN_WEIGHED - 2 :] = np.nan
+    assert weighed(arm, arm.held, poses) == (arm.held, n_used)
