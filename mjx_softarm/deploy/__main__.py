@@ -282,8 +282,8 @@ def check_payload(payload_g: float) -> None:
 def hung(driver: ArmIO, spec: ArmSpec, payload_g: float) -> float:
     """Return the payload [kg] of an arm with a mass more; a simulated arm gets it."""
     payload_kg = spec.mass.payload_kg + 1e-3 * payload_g
-    if payload_g and hasattr(driver, "attach"):
-        driver.attach(payload_kg)
+    if payload_g and (attach := getattr(driver, "attach", None)):
+        attach(payload_kg)
     return payload_kg
 
 
