@@ -97,7 +97,8 @@ def _run(
 
     Args:
         out: folder to write
-        since: calibration that goes on: the logs are later ones, and what has changed is all that is fitted
+        since: calibration that goes on: the logs are later ones, and tell what has changed and how payloads
+            are felt, nothing else
         shared_springs: fit one beta and one delta for all springs
         fit_compensation: fit the circuit's compensation inductance, too
         seed: seed of all random draws
@@ -131,7 +132,7 @@ def _run(
     lines = warning_lines(calibration.sections)
     lines += [f"note: {section.title}: {note}" for section in calibration.sections for note in section.notes]
     print("\n".join([*lines, f"report: {out / 'report.html'}"]))
-    if known and calibration.spec == known.spec:
+    if known and calibration.spec == known.spec and calibration.held is known.held:
         print(f"next: nothing to export; {since} stays the calibration of this arm")
     else:
         after = "train export RUN" if since else "train reach --preset analytic"

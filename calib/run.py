@@ -23,8 +23,9 @@ from typing import Any
 from calib.arm import CalibratedArm
 from calib.plan import RECORDED_FILE, Recorded, load_recorded, save_recorded
 from calib.read.measurements import measure
+from calib.read.static_poses import SAME_KG
 from calib.report.page import Section, to_html, to_json
-from calib.steps import STEPS, Extras, Step, changes
+from calib.steps import STEPS, Extras, Step, changes, payloads
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log
@@ -105,10 +106,16 @@ def go_on(
     Raises:
         LogError: the logs are of different arms.
     """
-    progress("changes ...")
     measurements = measure(later, since.spec, needed=("pressure_kpa",))
-    spec, section, _ = changes(measurements, since.arm, seed)
-    return dataclasses.replace(since, spec=spec, sections=(*since.sections, section))
+    loaded = measurements.poses.payload_kg > since.spec.mass.payload_kg + SAME_KG
+    steps = {"changes": changes} if not loaded.any() or not loaded.all() else {}
+    steps |= {"payloads": payloads} if loaded.any() else {}
+    for name, step in steps.items():
+        progress(f"{name} ...")
+        spec, section, found = step(measurements, since.arm, seed)
+        held = found.get("held", since.held)
+        since = dataclasses.replace(since, spec=spec, held=held, sections=(*since.sections, section))
+    return since
 
 
 def load_calibration(folder: Path) -> Calibration:

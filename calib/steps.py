@@ -23,13 +23,13 @@ from calib.fit.motion.actuators import fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
-from calib.fit.payload import payload_poses, told_widths, weighed
+from calib.fit.payload import LEAST_WEIGHT, MIN_WEIGHED, held_at, payload_poses, told_widths, weighed
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import motion, sections
-from calib.report.changes import CHANGES, changes_section
+from calib.report.changes import CHANGES, PAYLOADS, UNWEIGHED, changes_section, payloads_section
 from calib.report.page import Section
 from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.pose_pairs import PosePairs
@@ -164,22 +164,20 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     # Give a pose that was not held out the mean error of the held-out poses.
     error_mm = np.full(poses.n, fit.test.translation_mean_mm)
     error_mm[used[fit.held_out]] = pairs["with the network"].error_mm[fit.held_out]
+    # Fit the pressures that hold the arm.
+    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
     extras = Extras(pairs=pairs, error_mm=error_mm)
     if fit.is_better:
         extras["s2r"] = fit.s2r
-    # Fit the pressures that hold the arm.
-    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
     if not held.is_better:
         return StepResult(spec, section, extras)
+    extras["held"] = held.held
     spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
-    arm = CalibratedArm(spec, extras.get("s2r"), held.held)
-    known, n_weighed = weighed(arm, held.held, poses)
-    extras["held"] = known
-    # Say how well they tell payloads.
     largest_kg = spec.mass.largest_payload_kg
-    widths_kg = told_widths(known, payload_poses(arm._replace(held=known)), largest_kg)
+    at = payload_poses(CalibratedArm(spec, extras.get("s2r")))
+    widths_kg = told_widths(held.held, at, largest_kg)
     section = sections.with_pressures(section, held, widths_kg, LOOP.load_known * largest_kg)
-    return StepResult(spec, sections.with_factor(section, known, n_weighed), extras)
+    return StepResult(spec, section, extras)
 
 
 def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
@@ -197,6 +195,26 @@ def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepRe
     return StepResult(found.spec if found.is_better else spec, section)
 
 
+def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
+    """Fit how strongly an arm feels payloads to later poses with a known weight."""
+    spec, held = arm.spec, arm.held
+    if held is None:
+        needed = f"{NOT_FITTED} The calibration has no residual pressures."
+        return StepResult(spec, Section(PAYLOADS, needed, warnings=(f"payloads: {UNWEIGHED}",)))
+    # Take heavy poses, held by the simulated arm
+    poses = measurements.poses.with_lengths(spec)
+    poses = poses.take(_loaded(poses, spec))
+    if poses.n:
+        poses = poses.take(held_at(arm, poses.spring_m)[1])
+    if poses.n < MIN_WEIGHED:
+        least_g = 1e3 * LEAST_WEIGHT * spec.mass.largest_payload_kg
+        what = f"pressures and spring lengths, with a known payload of {least_g:.0f} g or more"
+        needed = f"{NOT_FITTED} {_few(MIN_WEIGHED, what, poses.n, measurements.row_uses)}"
+        return StepResult(spec, Section(PAYLOADS, needed, warnings=(f"payloads: {UNWEIGHED}",)))
+    found = weighed(arm, poses)
+    return StepResult(spec, payloads_section(found), Extras(held=found.held))
+
+
 STEPS: Mapping[str, Step] = MappingProxyType(
     {
         "springs": springs,
@@ -212,6 +230,12 @@ def _unloaded(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
     """Return the indices of the poses with spring lengths and no more than the specification's payload."""
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=SAME_KG)
     return np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+
+
+def _loaded(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
+    """Return the indices of the poses with spring lengths and a weight that counts."""
+    least_kg = spec.mass.payload_kg + LEAST_WEIGHT * spec.mass.largest_payload_kg - SAME_KG
+    return np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & (poses.payload_kg > least_kg))
 
 
 def _few(n: int, what: str, n_found: int, row_uses: Mapping[str, int]) -> str:

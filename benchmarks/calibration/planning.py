@@ -1,14 +1,15 @@
 """Trained policies of rods, arms of other physics, by the poses of their calibration, in the closed loop.
 
 Recordings of a rod share their first poses, which are random. The others are chosen by `calib plan` from the
-calibration by the first ones, or random. A rod's policies are trained by its first calibration, and
-exported with each of them: no training hides what a calibration does. The commands are those of the pages;
-poses are logged at rest, without the motion to them. A log of every tick tells the regulators. Nobody tells
-the loop what a rod carries.
+calibration by the first ones, or random; or the first calibration goes on with a circle of the policy under a
+known weight. A rod's policies are trained by its first calibration, and exported with each of them: no
+training hides what a calibration does. The commands are those of the pages; poses are logged at rest, without
+the motion to them. A log of every tick tells the regulators. Nobody tells the loop what a rod carries.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tempfile
 from collections.abc import Sequence
@@ -40,12 +41,12 @@ from mjx_softarm.twin.rod_twin import RodTwin
 
 N_FRAMES = 50  # averaged frames of a logged pose: a second
 FIRST, MORE_SEED, MOVING_SEED = 500, 1_000, 2_000  # random poses of all; seeds of other poses, plus the rod's
-WEIGHT_G, N_WEIGHED = 500, 20  # known weight, and number of poses with it
+WEIGHT_G, WEIGHED_POINTS = 500, 16  # known weight, and goals of the circle with it
 RECORDINGS = {
     "random": "500 random",
     "planned": "500 random, 200 planned",
     "more": "700 random",
-    "weighed": f"500 random, {N_WEIGHED} with {WEIGHT_G} g",
+    "weighed": f"500 random, a circle with {WEIGHT_G} g",
 }
 N_MORE = 200
 GRID_POINTS = 60  # goals of the grid, at most; 20 leave four on the rods
@@ -129,22 +130,24 @@ def targets(rows: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
 def _rows(rod: int, name: str, seed: int, home: Path, settings: tuple[str, int, int]) -> list[dict[str, Any]]:
     """Return the rows of a rod's policy with a recording; take those from their files that are there."""
     preset, steps, points = settings
-    folder, first = _calibrated(rod, name, home), _calibrated(rod, "random", home)
+    first = _calibrated(rod, "random", home)
 
     # Train by the first calibration, and export with this one
     run = first / f"{preset}-{steps}-seed{seed}"
-    calibration, policy = folder / "calibration", folder / f"{run.name}.npz"
     if not (run / "evaluation.json").exists():
         options = ("--calibration", first / "calibration", "--learner.total-env-steps", steps)
         anew = ("--preset", preset, *options, "--seed", seed, "--out", run)
         arguments = ("--resume", run) if (run / "config.json").exists() else anew
         run_command("train", "reach", *arguments, makes=run / "evaluation.json")
-    if not policy.exists():
-        other = () if folder == first else ("--calibration", calibration)
-        run_command("train", "export", run, *other, "--out", policy, makes=policy)
+    policy = _exported(run, first)
+    if name == "weighed":
+        policy = _exported(run, _weighed(rod, policy, home))
+    elif name != "random":
+        policy = _exported(run, _calibrated(rod, name, home))
 
     # The closed loop, on the circle with payloads and on the grid
-    report = json.loads((calibration / "report.json").read_text("utf-8"))["parts"]
+    reports = first if name == "weighed" else policy.parent
+    report = json.loads((reports / "calibration/report.json").read_text("utf-8"))["parts"]
     shared = {
         "rod": rod,
         "seed": seed,
@@ -164,6 +167,31 @@ def _rows(rod: int, name: str, seed: int, home: Path, settings: tuple[str, int, 
         rows.append(shared | {"goals": goals, "payload [g]": payload_g, **found})
         print(rows[-1], flush=True)
     return rows
+
+
+def _exported(run: Path, folder: Path) -> Path:
+    """Return the policy of a run with the calibration of a folder; export it if it is not there."""
+    policy = folder / f"{run.name}.npz"
+    if not policy.exists():
+        other = () if run.parent == folder else ("--calibration", folder / "calibration")
+        run_command("train", "export", run, *other, "--out", policy, makes=policy)
+    return policy
+
+
+def _weighed(rod: int, policy: Path, home: Path) -> Path:
+    """Return the folder of a calibration that goes on with a circle of a policy under a known weight."""
+    folder = home / f"rod{rod}-weighed-{policy.stem}"
+    if (folder / "calibration").exists():
+        return folder
+    folder.mkdir(exist_ok=True)
+    controller, kg = Controller.of(load_policy(policy)), 1e-3 * WEIGHT_G
+    goals = read_goals("circle", controller.policy, WEIGHED_POINTS)
+    log = follow(RodTwin(rod, payload_kg=kg), controller, list(goals)).log
+    write_log(folder / "heavy.npz", dataclasses.replace(log, payload_kg=np.full(len(log), kg)))
+    since = policy.parent / "calibration", "--out", folder / "calibration"
+    makes = folder / "calibration/report.json"
+    run_command("calib", "run", folder / "heavy.npz", "--since", *since, makes=makes)
+    return folder
 
 
 def of_run(run: LoopRun, controller: Controller, goals: np.ndarray, payload_g: float) -> dict[str, Any]:
@@ -218,26 +246,21 @@ def _calibrated(rod: int, name: str, home: Path) -> Path:
             save=lambda log: write_log(logs[1], log),
         )
     else:
-        # More poses, of a plan or random, or with a known weight
+        # More poses, of a plan or random
         known, table = _calibrated(rod, "random", home) / "calibration", folder / "next.csv"
         if name == "planned":
             run_command("calib", "plan", known, "--poses", N_MORE, "--out", table, makes=table)
             more_kpa = read_plan(table, spec)
         else:
-            more_kpa = random_pressures(spec, N_MORE if name == "more" else N_WEIGHED, rod + MORE_SEED)
-        payload_kg = 1e-3 * WEIGHT_G if name == "weighed" else 0.0
+            more_kpa = random_pressures(spec, N_MORE, rod + MORE_SEED)
         logs.append(folder / "more.npz")
-        write_log(logs[-1], log_at_rest(RodTwin(rod, session=S2R_SESSION), more_kpa, payload_kg))
+        write_log(logs[-1], log_at_rest(RodTwin(rod, session=S2R_SESSION), more_kpa))
     run_command("calib", "run", *logs, "--out", calibration, makes=calibration / "report.json")
     return folder
 
 
-def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray, payload_kg: float = 0.0) -> Log:
-    """Return a log of an arm at rest at pressures (n, n_chambers), each row the mean of a second.
-
-    A payload is hung at the arm.
-    """
-    arm.attach(payload_kg)
+def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
+    """Return a log of an arm at rest at pressures (n, n_chambers), each row the mean of a second."""
     rows: list[dict[str, np.ndarray]] = []
     for pressure in pressure_kpa:
         arm.settle(pressure)
@@ -256,5 +279,5 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray, payload_kg: float = 0.0)
         )
     n = len(pressure_kpa)
     columns: Any = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    kg = np.full(n, payload_kg)
+    kg = np.zeros(n)
     return Log(source="rod", row=np.arange(n) + 2, time_s=5.0 * np.arange(n), payload_kg=kg, **columns)

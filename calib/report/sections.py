@@ -13,14 +13,11 @@ from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import PressureFit
 from calib.fit.markers import MarkerLimits
 from calib.fit.parameters import BENDING, BOND, without_effect
-from calib.fit.payload import MIN_WEIGHED
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
 from calib.report.page import ReportTable, Section, plain
 from mjx_softarm._support.fields import PerSection
-from mjx_softarm.sensing.held_pressures import HeldPressures
-from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.sensing.s2r import correct
 
 _BINS = 40
@@ -227,24 +224,6 @@ def with_pressures(
         told = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
         warnings += (f"{told}: record the poses of `python -m calib plan`",)
     return dataclasses.replace(section, text=section.text + text, warnings=warnings, data=section.data | data)
-
-
-def with_factor(section: Section, held: HeldPressures, n_weighed: int) -> Section:
-    """Add to the network's section how well the scale of payloads is known, by poses with a known weight."""
-    percent = 100.0 * QUANTILE * held.factor_sd
-    if n_weighed < MIN_WEIGHED:
-        text = (
-            f" All payloads may be told up to {percent:.0f} % too high or too low (95 %): the log has "
-            f"{n_weighed} poses with a known weight, and {MIN_WEIGHED} would tell. Record them by "
-            "`python -m mjx_softarm.deploy record --payload`."
-        )
-    else:
-        text = (
-            f" {n_weighed} poses with a known weight change the pressures by {held.factor:.3f} of the "
-            f"simulated change, so payloads are told to {percent:.0f} % (95 %)."
-        )
-    data = {"payload_factor": {"factor": held.factor, "sd": held.factor_sd, "poses": n_weighed}}
-    return dataclasses.replace(section, text=section.text + text, data=section.data | data)
 
 
 def _errors(*rows: tuple[str, PoseErrors]) -> ReportTable:

@@ -28,7 +28,6 @@ from mjx_softarm.deploy.accuracy.measure import (
     write_accuracy,
 )
 from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
-from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.drivers.driven import Arms, finish
 from mjx_softarm.deploy.drivers.names import twin_spec
@@ -147,7 +146,8 @@ def _measure(
         payload: mass that hangs at the gripper, which the loop is not given; a simulated arm gets it [g]
     """
     # Checks, before the arm moves
-    check_payload(payload)
+    if not 0.0 <= payload < np.inf:
+        raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
     if seconds is not None and go_on:
@@ -166,8 +166,13 @@ def _measure(
 
     # The run, stop by stop or in time
     out.mkdir(parents=True)
-    payload_kg = hung(driver, controller.policy.spec, payload)
-    save = partial(save_with, out / "log.npz", payload_kg)
+    payload_kg = controller.policy.spec.mass.payload_kg + 1e-3 * payload
+    if payload and hasattr(driver, "attach"):
+        driver.attach(payload_kg)
+
+    def save(log: Log) -> None:
+        save_log(out / "log.npz", replace(log, payload_kg=np.full(len(log), payload_kg)))
+
     if seconds is None:
         run = follow(driver, controller, poses, tell=tell, save=save)
     else:
@@ -219,7 +224,6 @@ def _record(
     plan: cli.MaybePath = None,
     seed: int = 0,
     transients: bool = False,
-    payload: float = 0.0,
 ) -> int:
     """Log static poses at random pressures, for calibration; the first ten grow from a tenth of the range.
 
@@ -229,10 +233,8 @@ def _record(
         plan: pressures in place of random ones, from `python -m calib plan`
         seed: seed of the poses
         transients: log every tick, not the static poses alone
-        payload: known mass that hangs at the gripper; a simulated arm gets it [g]
     """
     # Checks, before the arm moves
-    check_payload(payload)
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
     own = twin_spec(on.arm)
@@ -251,9 +253,7 @@ def _record(
 
     # The recording and its results
     targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
-    payload_kg = hung(driver, arm_spec, payload)
-    save = partial(save_with, out, payload_kg) if payload else partial(save_log, out)
-    result = record(driver, arm_spec, targets_kpa, transients, tell, save)
+    result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out))
     finish(driver, tell)
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
@@ -271,25 +271,6 @@ def _record(
 def tell(text: str) -> None:
     """Print a line at once."""
     print(text, flush=True)
-
-
-def check_payload(payload_g: float) -> None:
-    """Refuse a payload that no arm can carry."""
-    if not 0.0 <= payload_g < np.inf:
-        raise InputError(f"--payload: got {payload_g:g}, expected a finite number >= 0")
-
-
-def hung(driver: ArmIO, spec: ArmSpec, payload_g: float) -> float:
-    """Return the payload [kg] of an arm with a mass more; a simulated arm gets it."""
-    payload_kg = spec.mass.payload_kg + 1e-3 * payload_g
-    if payload_g and (attach := getattr(driver, "attach", None)):
-        attach(payload_kg)
-    return payload_kg
-
-
-def save_with(file: Path, payload_kg: float, log: Log) -> None:
-    """Write a log with the payload of its rows."""
-    save_log(file, replace(log, payload_kg=np.full(len(log), payload_kg)))
 
 
 if __name__ == "__main__":

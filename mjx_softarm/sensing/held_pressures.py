@@ -15,8 +15,8 @@ corrects them. Its variance tells how well a payload is known: it is large far f
 
 A payload changes a chamber's pressure by the simulated change times a factor. The log of an unloaded arm does
 not show this factor: with all stiffnesses, areas and masses greater by the same share, the log is the same.
-So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`. Poses with
-a known weight tell the mean of all chambers (`calib.fit.payload.weighed`).
+So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`, or about
+what poses with a known weight have told (`calib.fit.payload.weighed`).
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
@@ -82,13 +82,13 @@ def held_kpa(
         rng: generator of residuals and factors for each arm; without one, means are returned.
     """
     found = residual(held, spring_m, light_kpa)
-    left_kpa, factor = found.mean_kpa, np.ones_like(light_kpa)
+    left_kpa, relative = found.mean_kpa, np.ones_like(light_kpa)
     if rng is not None:
         root, (m, n) = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
         normal = rng.standard_normal(left_kpa.shape)
         left_kpa = left_kpa + np.sqrt(found.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
-        factor = rng.multivariate_normal(np.ones(n), factor_covariance(held, n), m)
-    return light_kpa + left_kpa.reshape(light_kpa.shape) + held.factor * factor * effect_kpa
+        relative = rng.multivariate_normal(np.ones(n), factor_covariance(held, n), m)
+    return light_kpa + left_kpa.reshape(light_kpa.shape) + held.factor * relative * effect_kpa
 
 
 def sections_of(spring_m: np.ndarray, pressure_kpa: np.ndarray, n_sections: int) -> np.ndarray:
@@ -163,7 +163,7 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
         "hysteresis_kpa": (s,),
         "stroke_m": (s,),
     }
-    if f"{KIND}.factor" in entries:  # calibrations of before have none
+    if f"{KIND}.factor" in entries:  # older calibrations have none
         shapes |= {"factor": (), "factor_sd": ()}
     arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
     held = HeldPressures(**arrays)

@@ -9,8 +9,10 @@ import pytest
 
 import calib.demo
 from calib.__main__ import main
+from calib.arm import CalibratedArm
 from calib.demo import planted_arm, write_demo
 from calib.fit import network
+from calib.fit.payload import held_at
 from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.pose_pairs import read_pose_pairs
@@ -103,6 +105,31 @@ def test_a_calibration_goes_on_with_a_later_log(demo, calibrated, tmp_path, caps
     np.testing.assert_allclose(found_m, shift_m, atol=7e-4)
     assert (out / "s2r.npz").read_bytes() == (before / "s2r.npz").read_bytes()
     assert sorted(p.name for p in out.iterdir()) == sorted(p.name for p in before.iterdir())
+
+
+@pytest.mark.parametrize(("n", "logged_kg"), [(20, 0.5), (20, 5.0), (5, 0.5)])
+def test_a_later_log_with_a_known_weight_tells_how_payloads_are_felt(
+    demo, calibrated, tmp_path, capsys, n, logged_kg
+):
+    """The arm feels 0.9 of a payload; a wrong weight, or few poses, leave the calibration as it is."""
+    before, later, out = calibrated[1], tmp_path / "heavy.npz", tmp_path / "new"
+    arm = CalibratedArm.read(before)
+    log = read_log(demo[1], arm.spec)[0].take(np.arange(n))
+    spring_m = arm.spec.spring_sensor.lengths(log.readings).length_m
+    effect_kpa = 0.5 * 0.9 * held_at(arm, spring_m)[0].effect_kpa_per_kg
+    heavy = {"pressure_kpa": log.pressure_kpa + effect_kpa, "payload_kg": np.full(n, logged_kg)}
+    write_log(later, dataclasses.replace(log, **heavy))
+    status, said = main(["run", str(later), "--since", str(before), "--out", str(out)]), capsys.readouterr()
+    found = CalibratedArm.read(out)
+    assert found.spec == arm.spec
+    if (n, logged_kg) == (20, 0.5):
+        assert found.held.factor == pytest.approx(0.9, abs=0.03) and found.held.factor_sd < 0.04
+        assert "note: Payloads: payloads were told -" in said.out
+        assert "next: python -m train export RUN --calibration" in said.out
+    else:
+        why = "check the weight and its unit" if n == 20 else "measure 8 goals or more with a known weight"
+        assert found.held.factor == 1.0 and status == 1 and why in said.out
+        assert "next: nothing to export" in said.out
 
 
 def test_a_later_log_that_shows_no_change_names_no_export(demo, calibrated, tmp_path, capsys):

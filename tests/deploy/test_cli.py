@@ -216,20 +216,6 @@ def test_a_plan_of_pressures_is_recorded(tmp_path, capsys):
     assert "arm: paper, 9 chambers, -40 to 20 kPa, by default; --spec names another arm\n" in said
 
 
-def test_a_known_weight_hangs_at_a_simulated_arm_and_is_logged(tmp_path):
-    plan = tmp_path / "next.csv"
-    write_plan(plan, np.array([[-10.0] * 9, [-5.0] * 9]))
-    tips, found_kg = [], []
-    for name, options in (("light", []), ("heavy", ["--payload", "400"])):
-        out = str(tmp_path / f"{name}.csv")
-        assert main(["record", "--arm", "twin:rod:101", "--plan", str(plan), "--out", out, *options]) == 0
-        log = read_log(out)[0]
-        tips.append(log.tip_m[0])
-        found_kg.append(log.payload_kg)
-    assert found_kg[0] is None and found_kg[1].tolist() == [0.4, 0.4]
-    assert np.linalg.norm(tips[1] - tips[0]) > 3e-3
-
-
 @pytest.mark.parametrize(
     ("name", "spec"),
     [
