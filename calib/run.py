@@ -101,14 +101,16 @@ def go_on(
     seed: int = 0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
-    """Return a calibration with what has changed since then, by later logs; arguments as of `calibrate`.
+    """Return a calibration that goes on with later logs; arguments as of `calibrate`.
+
+    Poses without a payload tell what has changed, poses with a known weight how strongly payloads are felt.
 
     Raises:
         LogError: the logs are of different arms.
     """
     measurements = measure(later, since.spec, needed=("pressure_kpa",))
     loaded = measurements.poses.payload_kg > since.spec.mass.payload_kg + SAME_KG
-    steps = {"changes": changes} if not loaded.any() or not loaded.all() else {}
+    steps = {} if len(loaded) and loaded.all() else {"changes": changes}
     steps |= {"payloads": payloads} if loaded.any() else {}
     for name, step in steps.items():
         progress(f"{name} ...")

@@ -29,7 +29,7 @@ from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import motion, sections
-from calib.report.changes import CHANGES, PAYLOADS, UNWEIGHED, changes_section, payloads_section
+from calib.report.changes import CHANGES, PAYLOADS, changes_section, payloads_section
 from calib.report.page import Section
 from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.pose_pairs import PosePairs
@@ -199,20 +199,28 @@ def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
     """Fit how strongly an arm feels payloads to later poses with a known weight."""
     spec, held = arm.spec, arm.held
     if held is None:
-        needed = f"{NOT_FITTED} The calibration has no residual pressures."
-        return StepResult(spec, Section(PAYLOADS, needed, warnings=(f"payloads: {UNWEIGHED}",)))
-    # Take heavy poses, held by the simulated arm
+        remedy = f"no residual pressures: record {MIN_S2R_POSES} poses at rest or more, and calibrate anew"
+        return StepResult(spec, Section(PAYLOADS, NOT_FITTED, warnings=(remedy,)))
+    # Take heavy poses that the simulated arm holds.
     poses = measurements.poses.with_lengths(spec)
-    poses = poses.take(_loaded(poses, spec))
-    if poses.n:
-        poses = poses.take(held_at(arm, poses.spring_m)[1])
-    if poses.n < MIN_WEIGHED:
-        least_g = 1e3 * LEAST_WEIGHT * spec.mass.largest_payload_kg
-        what = f"pressures and spring lengths, with a known payload of {least_g:.0f} g or more"
-        needed = f"{NOT_FITTED} {_few(MIN_WEIGHED, what, poses.n, measurements.row_uses)}"
-        return StepResult(spec, Section(PAYLOADS, needed, warnings=(f"payloads: {UNWEIGHED}",)))
-    found = weighed(arm, poses)
-    return StepResult(spec, payloads_section(found), Extras(held=found.held))
+    poses = poses.take(np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1)))
+    least_kg = LEAST_WEIGHT * spec.mass.largest_payload_kg
+    rows = np.flatnonzero(poses.payload_kg > spec.mass.payload_kg + least_kg - SAME_KG)
+    if len(rows):
+        rows = rows[held_at(arm, poses.spring_m[rows])[1]]
+    if len(rows) < MIN_WEIGHED:
+        what = f"pressures and spring lengths, {1e3 * least_kg:.0f} g or more on top of the arm's own payload"
+        needed = f"{NOT_FITTED} {_few(MIN_WEIGHED, what, len(rows), measurements.row_uses)}"
+        got = f"got {len(rows)} poses with {1e3 * least_kg:.0f} g or more, expected {MIN_WEIGHED}"
+        remedy = "measure more goals with a known weight (`deploy measure --payload`)"
+        return StepResult(spec, Section(PAYLOADS, needed, warnings=(f"{got}: {remedy}",)))
+    # Fit them; a ratio that no arm has is not believed.
+    found = weighed(arm, poses, rows)
+    section = payloads_section(found)
+    if not found.is_plausible:
+        return StepResult(spec, section)
+    known = held._replace(factor=found.factor, factor_sd=found.factor_sd)
+    return StepResult(spec, section, Extras(held=known))
 
 
 STEPS: Mapping[str, Step] = MappingProxyType(
@@ -230,12 +238,6 @@ def _unloaded(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
     """Return the indices of the poses with spring lengths and no more than the specification's payload."""
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=SAME_KG)
     return np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
-
-
-def _loaded(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
-    """Return the indices of the poses with spring lengths and a weight that counts."""
-    least_kg = spec.mass.payload_kg + LEAST_WEIGHT * spec.mass.largest_payload_kg - SAME_KG
-    return np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & (poses.payload_kg > least_kg))
 
 
 def _few(n: int, what: str, n_found: int, row_uses: Mapping[str, int]) -> str:

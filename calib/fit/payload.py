@@ -55,8 +55,8 @@ N_POSES, SEED = 400, 1  # poses over the workspace, and their seed
 # payload: less is hardly told from errors of the pressures.
 MIN_WEIGHED, LEAST_WEIGHT = 8, 0.25
 MOST_OFF = 0.3  # six standard deviations of a factor
-# Standard deviation of a fitted factor where it was fitted. On the circle of rods 100 to 104, which no
-# experiment uses, 500 g tell 1 kg to 0.007; random poses are off by 0.037, which `OWN_FACTOR` covers.
+# Standard deviation of a fitted factor at poses like those of the fit. On the circle of rods 100 to 104,
+# which no experiment uses, 500 g tell 1 kg to 0.007. Factors of random poses are off there by 0.037.
 LEFT_FACTOR = 0.02
 
 
@@ -170,40 +170,40 @@ def told_payload(
 class Weighed(NamedTuple):
     """What poses with a known weight tell of all payloads."""
 
-    held: HeldPressures  # with their factor, where that is plausible
     ratio: float  # payload that was told, over the weight
+    factor: float  # new `HeldPressures.factor`
+    factor_sd: float
     n: int  # poses
 
     @property
     def is_plausible(self) -> bool:
-        """Whether an arm can feel payloads so; otherwise the weight is probably not the log's."""
+        """Whether an arm can feel payloads so; otherwise the logged weight is wrong, or the arm changed."""
         return abs(self.ratio - 1.0) < MOST_OFF
 
 
-def weighed(arm: CalibratedArm, poses: StaticPoses) -> Weighed:
+def weighed(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> Weighed:
     """Fit the factor of payloads to poses with a known weight.
 
     Args:
-        arm: calibrated arm, with residual pressures.
-        poses: `MIN_WEIGHED` poses at rest or more, of `LEAST_WEIGHT` or more, in the order of time.
+        arm: calibrated arm, with residual pressures; its factor is what is believed so far.
+        poses: poses with spring lengths, in the order of time, which hysteresis follows.
+        rows (k,): indices of `MIN_WEIGHED` poses or more with weights of `LEAST_WEIGHT` or more.
     """
     spec, held = arm.spec, arm.held
     if held is None:
         raise ValueError("arm.held: got None, expected residual pressures")
-    weight_kg = poses.payload_kg - spec.mass.payload_kg
-    kpa = without_redundant_part(poses.pressure_kpa, poses.spring_m, spec)
-    kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)
-    told_kg, _ = told_payload(arm._replace(held=held._replace(factor=1.0)), poses.spring_m, kpa)
-    # Least squares, beside the normal distribution of what a weight can tell
-    information, known = np.sum(weight_kg**2), COMMON_FACTOR**2 - LEFT_FACTOR**2
+    # Tell the weights by what pressures remain
+    weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
+    kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
+    kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)[rows] - spec.unmodelled_kpa(spring_m)
+    told_kg, _ = told_payload(arm, spring_m, kpa)
+    # Least squares for their ratio, with a prior: what a weight can tell of a factor's deviation
+    information, prior = np.sum(weight_kg**2), COMMON_FACTOR**2 - LEFT_FACTOR**2
     ratio = np.sum(told_kg * weight_kg) / information
-    variance = np.sum((told_kg - ratio * weight_kg) ** 2) / (len(told_kg) - 1) / information
-    share = known / (known + variance)
-    sd = np.sqrt(share * variance + LEFT_FACTOR**2)
-    found = Weighed(held, float(ratio), len(told_kg))
-    if not found.is_plausible:
-        return found
-    return found._replace(held=held._replace(factor=float(1.0 + share * (ratio - 1.0)), factor_sd=float(sd)))
+    variance = np.sum((told_kg - ratio * weight_kg) ** 2) / (len(rows) - 1) / information
+    share = prior / (prior + variance)
+    factor, sd = held.factor * (1.0 + share * (ratio - 1.0)), np.sqrt(share * variance + LEFT_FACTOR**2)
+    return Weighed(float(ratio), float(factor), float(sd), len(rows))
 
 
 def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -> np.ndarray:

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 
 from calib.changes import Changes
-from calib.fit.payload import MIN_WEIGHED, MOST_OFF, Weighed
+from calib.fit.payload import MOST_OFF, Weighed
 from calib.report.page import ReportTable, Section, plain
 from mjx_softarm.sensing.load import QUANTILE
 
 CHANGES, PAYLOADS = "Changes", "Payloads"
-UNWEIGHED = f"measure {MIN_WEIGHED} goals or more with a known weight (`deploy measure --payload`)"
 ENOUGH = 2.0  # held-out error over that of the calibration, from which there is a warning; by hand
 
 
@@ -64,18 +63,19 @@ def changes_section(found: Changes, known_mm: float) -> Section:
 def payloads_section(found: Weighed) -> Section:
     """Show how strongly the arm feels payloads, by poses with a known weight."""
     told = f"{found.n} poses with a known weight were told as {found.ratio:.3f} of it in the mean"
-    data: dict[str, float] = {"poses": found.n, "ratio": found.ratio}
     if not found.is_plausible:
-        expected = f"expected {1.0 - MOST_OFF:.1f} to {1.0 + MOST_OFF:.1f}: check the weight and its unit"
-        return Section(PAYLOADS, f"{told}.", warnings=(f"{told}, {expected}",), data=data)
-    percent = 100.0 * QUANTILE * found.held.factor_sd
+        expected = f"expected {1.0 - MOST_OFF:.1f} to {1.0 + MOST_OFF:.1f}"
+        remedy = "check the weight and its unit, and whether the arm has changed since the calibration"
+        warning = f"{told}, {expected}: {remedy}"
+        return Section(PAYLOADS, f"{told}.", warnings=(warning,), data=found._asdict())
+    percent = 100.0 * QUANTILE * found.factor_sd
     text = (
-        f"{told}. So a payload changes the pressures by {found.held.factor:.3f} of the simulated change. "
-        f"Around these poses this scale is known to {percent:.0f} % (95 %); other errors add to it."
+        f"{told}. So a payload changes the pressures by {found.factor:.3f} of the simulated change. Near "
+        f"these poses this factor is known to {percent:.0f} % (95 %); other errors add to it."
     )
-    data |= {"factor": found.held.factor, "factor_sd": found.held.factor_sd}
-    note = f"payloads were told {100.0 * (found.ratio - 1.0):+.1f} % off, which is corrected"
-    return Section(PAYLOADS, text, data=data, notes=(note,))
+    off = 100.0 * (found.ratio - 1.0)
+    note = f"payloads were told {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
+    return Section(PAYLOADS, text, data=found._asdict(), notes=(note,))
 
 
 def _rows(name: str, *columns: np.ndarray) -> tuple[tuple[Any, ...], ...]:

@@ -48,7 +48,7 @@ class HeldPressures(NamedTuple):
     covariance_kpa2: np.ndarray  # (s, c, c) V
     hysteresis_kpa: np.ndarray  # (s,) largest pressure of a chamber's hysteresis
     stroke_m: np.ndarray  # (s,) stroke of its stop operator
-    # Change by a payload over the simulated one, mean of all chambers, and its relative standard deviation.
+    # A payload's change of all chambers' pressures, real over simulated, and its relative standard deviation.
     factor: float = 1.0
     factor_sd: float = COMMON_FACTOR
 

@@ -39,9 +39,9 @@ N_JUMPS = 2  # number of consecutive outliers that restart the average
 QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
 # Payloads in the network's data, as shares of the largest one: an interval outside holds no payload.
 LOWEST, HIGHEST = -0.5, 1.5
-# Standard deviations of the factors by which the simulated change is off: of all chambers together, by
-# masses and areas that are off by some per cent, where no known weight has told it; of each chamber at each
-# pose. A little more than on rods 100 to 104, which no experiment uses: 0.04 and 0.08.
+# Standard deviations of the factors by which the simulated change is off. The first is of all chambers
+# together, by masses and areas that are off by some per cent, until a known weight tells. The second is of
+# each chamber at each pose. Rods 100 to 104, which no experiment uses, have a little less: 0.04 and 0.08.
 COMMON_FACTOR, OWN_FACTOR = 0.05, 0.09
 N_PASSES = 2  # number of estimates; each takes D of the last
 

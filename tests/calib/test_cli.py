@@ -124,10 +124,10 @@ def test_a_later_log_with_a_known_weight_tells_how_payloads_are_felt(
     assert found.spec == arm.spec
     if (n, logged_kg) == (20, 0.5):
         assert found.held.factor == pytest.approx(0.9, abs=0.03) and found.held.factor_sd < 0.04
-        assert "note: Payloads: payloads were told -" in said.out
+        assert "note: Payloads: payloads were told 1" in said.out and "% too light" in said.out
         assert "next: python -m train export RUN --calibration" in said.out
     else:
-        why = "check the weight and its unit" if n == 20 else "measure 8 goals or more with a known weight"
+        why = "check the weight and its unit" if n == 20 else "expected 8: measure more goals with a known"
         assert found.held.factor == 1.0 and status == 1 and why in said.out
         assert "next: nothing to export" in said.out
 
