@@ -141,15 +141,12 @@ def _rows(rod: int, name: str, seed: int, home: Path, settings: tuple[str, int, 
         anew = ("--preset", preset, *options, "--seed", seed, "--out", run)
         arguments = ("--resume", run) if (run / "config.json").exists() else anew
         run_command("train", "reach", *arguments, makes=run / "evaluation.json")
-    policy = _exported(run, first)
-    if name == "weighed":
-        policy = _exported(run, _weighed(rod, policy, home))
-    elif name != "random":
-        policy = _exported(run, _calibrated(rod, name, home))
+    weighs = name == "weighed"  # its report has the weight alone, the rest is that of the first calibration
+    folder = _weighed(rod, _exported(run, first), home) if weighs else _calibrated(rod, name, home)
+    policy, reported = _exported(run, folder), first if weighs else folder
 
     # The closed loop, on the circle with payloads and on the grid
-    reports = first if name == "weighed" else policy.parent
-    report = json.loads((reports / "calibration/report.json").read_text("utf-8"))["parts"]
+    report = json.loads((reported / "calibration/report.json").read_text("utf-8"))["parts"]
     shared = {
         "rod": rod,
         "seed": seed,

@@ -168,7 +168,7 @@ def told_payload(
 
 
 class Weighed(NamedTuple):
-    """What poses with a known weight tell of all payloads."""
+    """Factor of all payloads by poses with a known weight, and how well the weight itself was told."""
 
     ratio: float  # payload that was told, over the weight
     factor: float  # new `HeldPressures.factor`

@@ -150,6 +150,7 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
     if not file.exists():
         return None
     entries = Entries(read_sealed(file, KIND, "python -m calib run"), str(file))
+    # Shapes of the arm's entries
     s, c = n_sections, n_chambers // n_sections
     d = n_springs // n_sections + c
     shapes: dict[str, tuple[int | None, ...]] = {
@@ -165,6 +166,7 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
     }
     if f"{KIND}.factor" in entries:  # older calibrations have none
         shapes |= {"factor": (), "factor_sd": ()}
+    # Take them, and check what shapes do not show
     arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
     held = HeldPressures(**arrays)
     if len(held.state) != len(held.residual_kpa):

@@ -54,7 +54,7 @@ def arm():
 def poses_with(arm, factor, weight_kg, n, seed):
     """Poses with a weight, of an arm whose chambers answer to it by this factor."""
     at = payload_poses(arm, n, seed)
-    true = arm.held._replace(factor=factor / arm.held.factor, factor_sd=0.0)
+    true = arm.held._replace(factor=factor, factor_sd=0.0)
     effect_kpa, rng = weight_kg * at.effect_kpa_per_kg, np.random.default_rng(seed)
     kpa = held_kpa(true, at.spring_m, at.pressure_kpa, effect_kpa, rng)
     kpa = kpa + hysteresis_kpa(arm.spec, arm.held, at.spring_m) + arm.spec.unmodelled_kpa(at.spring_m)
