@@ -28,6 +28,7 @@ from train.agent.learner import Learner
 
 N_GOALS = 2_000
 NEAR_MM = 5.0  # tip error of an arm that has arrived, in motion
+UNCORRECTED = np.zeros(6)  # limit of a shift of goals
 PATH = 80  # goals that one arm visits in turn; two laps of the circle are one path, too
 
 
@@ -102,13 +103,21 @@ class Evaluator:
 
     Every goal gets `n_actions` of the deterministic policy, and the state after the last counts. Each of many
     arms goes from goal to goal of its part of the workspace. One goes twice around the circle, and its second
-    lap counts.
+    lap counts. Goals are corrected as by the control loop, by `shift_limit` (6,) [mm, deg] at most.
     """
 
-    def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS, n_actions: int = N_ACTIONS):
+    def __init__(
+        self,
+        env: ReachEnv,
+        learner: Learner,
+        n_goals: int = N_GOALS,
+        n_actions: int = N_ACTIONS,
+        shift_limit: np.ndarray = UNCORRECTED,
+    ):
         self.env, self.learner, self.n_goals = nominal(env), learner, n_goals
         self.circle = np.asarray(circle_poses(env.spec))
-        self._follow = xla.jit(jax.vmap(follower(self.env, learner, n_actions), in_axes=(None, 0, 0)))
+        go = follower(self.env, learner, n_actions, shift_limit)
+        self._follow = xla.jit(jax.vmap(go, in_axes=(None, 0, 0)))
 
     @functools.cached_property
     def goals(self) -> np.ndarray:
@@ -116,9 +125,11 @@ class Evaluator:
         sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
         return np.concatenate([poses.pose for poses in sets])
 
-    def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> Evaluator:
+    def on(
+        self, env: ReachEnv, n_actions: int = N_ACTIONS, shift_limit: np.ndarray = UNCORRECTED
+    ) -> Evaluator:
         """Return the same evaluation on another environment."""
-        return Evaluator(env, self.learner, self.n_goals, n_actions)
+        return Evaluator(env, self.learner, self.n_goals, n_actions, shift_limit)
 
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
         """Return figures, and the results on the first set and on the circle as NumPy arrays."""
@@ -159,16 +170,30 @@ def towards(env: ReachEnv, state: State, goal: Array) -> State:
 
 
 def reach(
-    env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Array, n_actions: int = N_ACTIONS
+    env: ReachEnv,
+    learner: Learner,
+    policy: Any,
+    state: State,
+    goal: Array,
+    n_actions: int = N_ACTIONS,
+    shift_limit: np.ndarray = UNCORRECTED,
 ) -> tuple[State, Reached]:
-    """Take n actions with one arm towards a goal (6,); return its state and the result."""
+    """Take n actions with one arm towards a goal (6,); return its state and the result.
 
-    def act(state: State, _):
+    Each action leaves an error, which is subtracted from the goal of the next, by `shift_limit` at most.
+    """
+
+    def act(before: tuple[State, Array], _):
+        state, shift = before
         after = env.step(state, learner.mode(policy, state.obs))
-        return after, {name: after.info.get(name, ()) for name in ("valid", "clearance_mm", "path_mm")}
+        left = rewards.asked_error(after.pipeline_state.pose, goal, env.config.reward)
+        shift = jnp.clip(shift - left, -shift_limit, shift_limit)
+        told = {name: after.info.get(name, ()) for name in ("valid", "clearance_mm", "path_mm")}
+        return (towards(env, after, goal + shift), shift), told
 
     # Act, and find what the whole way tells.
-    state, way = jax.lax.scan(act, towards(env, state, goal), None, length=n_actions)
+    begin = towards(env, state, goal), jnp.zeros(6)
+    (state, _), way = jax.lax.scan(act, begin, None, length=n_actions)
     arm = state.pipeline_state
     near_s = overshoot_mm = jnp.asarray(jnp.nan)
     if env.config.moves:
@@ -205,19 +230,29 @@ def way_figures(way_mm: Array, goal_mm: Array, period_s: float) -> tuple[Array, 
 
 
 def follow(
-    env: ReachEnv, learner: Learner, policy: Any, path: Array, state: State, n_actions: int = N_ACTIONS
+    env: ReachEnv,
+    learner: Learner,
+    policy: Any,
+    path: Array,
+    state: State,
+    n_actions: int = N_ACTIONS,
+    shift_limit: np.ndarray = UNCORRECTED,
 ) -> Reached:
     """Return the results of one arm, from a state, along a path (n, 6) of goals."""
 
     def go_on(state: State, goal: Array) -> tuple[State, Reached]:
-        return reach(env, learner, policy, state, goal, n_actions)
+        return reach(env, learner, policy, state, goal, n_actions, shift_limit)
 
     return jax.lax.scan(go_on, state, path)[1]
 
 
-def follower(env: ReachEnv, learner: Learner, n_actions: int) -> Callable[[Any, Array, Array], Reached]:
+def follower(
+    env: ReachEnv, learner: Learner, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
+) -> Callable[[Any, Array, Array], Reached]:
     """Return the function of policy, path and key that follows a path from a random start."""
-    return lambda policy, path, key: follow(env, learner, policy, path, env.reset(key), n_actions)
+    return lambda policy, path, key: follow(
+        env, learner, policy, path, env.reset(key), n_actions, shift_limit
+    )
 
 
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:

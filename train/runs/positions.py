@@ -26,6 +26,7 @@ from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import static_poses
 from train.runs.evaluate import (
     N_ACTIONS,
+    UNCORRECTED,
     Figures,
     Reached,
     figure,
@@ -78,7 +79,7 @@ class PositionEvaluator:
     In motion, `N_STARTS` arms with the environment's randomisation begin without velocity at different
     positions, each in the equilibrium of the nominal arm, and go around once. After `n_actions` towards a
     position, each has to stay there for `HOLD_S`. `first` (m,) bool tells the positions that are goals
-    from the start.
+    from the start. At rest, goals are corrected as in `Evaluator`.
 
     Raises:
         ConfigError: in motion, the arm does not come to rest at a position.
@@ -91,17 +92,20 @@ class PositionEvaluator:
         demonstrations: Demonstrations,
         first: np.ndarray,
         n_actions: int = N_ACTIONS,
+        shift_limit: np.ndarray = UNCORRECTED,
     ):
         self.learner, self.demonstrations, self.first = learner, demonstrations, first
         self.positions = np.asarray(demonstrations.positions, np.float32)  # (m, 6)
         self.moves = env.config.moves
         self.env = env if self.moves else nominal(env)
-        go = self._around(n_actions) if self.moves else follower(self.env, learner, n_actions)
-        self._go = xla.jit(go)
+        at_rest = follower(self.env, learner, n_actions, shift_limit)
+        self._go = xla.jit(self._around(n_actions) if self.moves else at_rest)
 
-    def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> PositionEvaluator:
+    def on(
+        self, env: ReachEnv, n_actions: int = N_ACTIONS, shift_limit: np.ndarray = UNCORRECTED
+    ) -> PositionEvaluator:
         """Return the same evaluation on another environment."""
-        return PositionEvaluator(env, self.learner, self.demonstrations, self.first, n_actions)
+        return PositionEvaluator(env, self.learner, self.demonstrations, self.first, n_actions, shift_limit)
 
     def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
         """Return figures, and results as NumPy arrays."""

@@ -1,11 +1,17 @@
 """Evaluation: its arithmetic on results made by hand, and policies whose error is known beforehand."""
 
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_softarm.env.state import State
+from mjx_softarm.mdp.rewards import RewardConfig
 from train.runs import evaluate
-from train.runs.evaluate import Evaluator, Reached, summarise, way_figures
+from train.runs.evaluate import Evaluator, Reached, reach, summarise, way_figures
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -62,8 +68,8 @@ class Scripted:
 def evaluator(short_env):
     """Evaluator that takes two actions to each goal, and tells as `near_s` how many were taken."""
 
-    def counted(env, learner, policy, state, goal, n_actions, take=evaluate.reach):
-        after, result = take(env, learner, policy, state, goal, n_actions)
+    def counted(env, learner, policy, state, goal, *how, take=evaluate.reach):
+        after, result = take(env, learner, policy, state, goal, *how)
         return after, result._replace(near_s=after.pipeline_state.n_steps - state.pipeline_state.n_steps)
 
     goals = short_env.pool.pose[:64]
@@ -95,6 +101,43 @@ def test_an_arm_that_fails_on_the_way_counts_as_unsettled(evaluator, actions):
     figures, workspace, _ = evaluator(actions.at[3].set(jnp.nan))
     assert not workspace.settled[3] and workspace.settled.sum() == len(actions) - 1
     assert figures.unsettled == 2 and figures.reached_share == 1 - 1 / len(actions)
+
+
+class Tip(NamedTuple):
+    """A tip that goes where an action says, and a little farther."""
+
+    pose: jax.Array = jnp.zeros(6)
+    goal: jax.Array = jnp.zeros(6)
+    sensed: None = None
+    pressure_kpa: jax.Array = jnp.zeros(1)
+
+
+@pytest.mark.parametrize(
+    ("limit", "left"),
+    [
+        (evaluate.UNCORRECTED, [12.0, -4.0, 0.0, 6.0, 0.0, 0.0]),
+        (np.repeat([25.0, 5.0], 3), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
+        (np.repeat([10.0, 9.0], 3), [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, left):
+    away, reward = jnp.array([12.0, -4.0, 0.0, 6.0, 0.0, 0.0]), RewardConfig()
+
+    def step(state, action):
+        return state.replace(pipeline_state=state.pipeline_state._replace(pose=action + away))
+
+    env = SimpleNamespace(
+        step=step,
+        observe=lambda pose, goal, sensed: goal,
+        config=SimpleNamespace(moves=False, reward=reward),
+    )
+    info, metrics = {"valid": jnp.array(True), "clearance_mm": jnp.inf}, {"saturated_chambers": jnp.zeros(())}
+    begin = State(Tip(), jnp.zeros(6), jnp.zeros(()), jnp.zeros(()), metrics, info)
+    goal = jnp.array([30.0, 0.0, 500.0, 0.0, 10.0, 0.0])
+    obedient = SimpleNamespace(mode=lambda policy, obs: obs)
+    _, found = reach(env, obedient, None, begin, goal, 3, limit)
+    np.testing.assert_allclose(found.pose - goal, left, atol=1e-4)
+    np.testing.assert_array_equal(found.goal, goal)
 
 
 def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():

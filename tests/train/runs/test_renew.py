@@ -3,15 +3,17 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from calib.arm import CalibratedArm
 from mjx_softarm import ArmSpec
-from mjx_softarm._support.provenance import write_json
+from mjx_softarm.deploy.controller import LOOP
+from mjx_softarm.env import EnvConfig
 from tests.train.small import CONFIG, SHORT
 from train.runs.checkpoint import RunError
-from train.runs.folder import EVALUATION_FILE, Run
+from train.runs.folder import Run
 from train.runs.renew import renewed, told_enough
 
 
@@ -23,45 +25,67 @@ def test_another_arm_is_refused(tmp_path):
 
 @pytest.fixture
 def run_of(tmp_path, imitation_config):
-    """Learner, preset and figures -> a finished run."""
+    """Learner and preset -> a run."""
 
-    def make(learner, preset, figures):
+    def make(learner, preset):
         config = imitation_config if learner == "imitation" else CONFIG
-        run = Run.create(tmp_path / "then", config, CalibratedArm(SHORT), preset=preset)
-        write_json(run.path / EVALUATION_FILE, figures)
-        return Run.open(run.path)
+        return Run.create(tmp_path / "then", config, CalibratedArm(SHORT), preset=preset)
 
     return make
 
 
+THEN = {"median_mm": 0.3, "reached_share": 0.99}
+
+
 @pytest.mark.parametrize(
-    ("median_mm", "saturated_share", "enough"), [(1.4, 0.12, True), (1.6, 0.1, False), (1.0, 0.16, False)]
+    ("median_mm", "reached_share", "s2r_mm", "expected_mm", "enough"),
+    [
+        (0.38, 0.96, 0.0, 0.38, True),
+        (0.40, 0.99, 0.0, 0.40, False),
+        (0.40, 0.99, 0.4, 0.57, True),  # 0.3 and 0.4 mm were 0.5
+        (0.55, 0.99, 0.4, 0.68, False),
+        (0.30, 0.93, 0.4, 0.50, False),
+    ],
 )
-def test_training_is_needed_where_simulated_errors_grow(
-    median_mm, saturated_share, enough, run_of, monkeypatch, capsys
+def test_training_is_needed_where_errors_grow(
+    median_mm, reached_share, s2r_mm, expected_mm, enough, run_of, monkeypatch, capsys
 ):
-    then = run_of("tqc", "payload", {"median_mm": 1.0, "saturated_share": 0.1})
-    said = told(then, {"median_mm": median_mm, "saturated_share": saturated_share}, monkeypatch, capsys)
-    assert f"median tip error 1.00 mm on the arm of the training, {median_mm:.2f} mm on the later one" in said
+    now = {"median_mm": median_mm, "reached_share": reached_share}
+    then = run_of("tqc", "payload")
+    then.arm = then.arm._replace(s2r=SimpleNamespace(error_mm=s2r_mm))
+    said = told(then, THEN, now, monkeypatch, capsys)
+    assert f"median tip error 0.30 mm on the arm of the training, {median_mm:.2f} mm on the later one" in said
+    assert f"and {expected_mm:.2f} mm; 99.0 and {100 * reached_share:.1f} % of the goals reached" in said
     assert ("enough without training" in said and "NOT" not in said) == enough
     command = f"python -m train reach --agent {then.path} --calibration new --preset payload"
     assert (f"go on training: {command}" in said) != enough
 
 
 def test_a_run_from_demonstrations_goes_on_with_them(run_of, monkeypatch, capsys):
-    then = run_of("imitation", "pipe", {"median_mm": 1.0})
+    then = run_of("imitation", "pipe")
     command = f"python -m train imitate {then.path}/demonstrations.npz --agent {then.path} --calibration new"
-    assert f"{command} --preset pipe" in told(then, {"median_mm": 2.0}, monkeypatch, capsys)
+    assert f"{command} --preset pipe" in told(then, THEN, THEN | {"median_mm": 2.0}, monkeypatch, capsys)
 
 
-def told(then, figures, monkeypatch, capsys):
-    """Advice by the later arm's figures; those of the run itself are not found anew."""
+@pytest.mark.parametrize("moves", [False, True])
+def test_goals_are_corrected_as_by_the_loop_at_rest_alone(moves, run_of, monkeypatch, capsys):
+    then = run_of("tqc", "payload")
+    monkeypatch.setattr(EnvConfig, "moves", moves)
+    limit = np.zeros(6) if moves else LOOP.shift_limit
+    told(then, THEN, THEN, monkeypatch, capsys, limit)
+
+
+def told(then, old, new, monkeypatch, capsys, limit=None):
+    """Advice by the figures of the run and of the later arm."""
     now = renewed(then, then.arm)
 
     def task_of(run):
-        assert run is now
-        summary = SimpleNamespace(to_dict=lambda: figures)
-        return SimpleNamespace(evaluate=lambda policy: (summary, None, None))
+        def on(env, shift_limit):
+            assert env == "own" and (limit is None or np.array_equal(shift_limit, limit))
+            summary = SimpleNamespace(to_dict=lambda: old if run is then else new)
+            return lambda policy: (summary, None, None)
+
+        return SimpleNamespace(evaluate=SimpleNamespace(env="own", on=on))
 
     monkeypatch.setattr("train.runs.run.task_of_run", task_of)
     monkeypatch.setattr(Run, "policy", lambda run: None)
