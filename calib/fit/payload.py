@@ -12,7 +12,8 @@ of virtual work, chambers of effective areas A that lift a payload at the height
     m g dz = sum_t A_t dp_t dc_t    for all changes dc of the chambers' lengths.
 
 So where the sim-to-real network raises the simulated tip by h, e grows by g (dh / dc) / A. A real arm's tip
-lies up to some centimetres aside of the simulated one, which is a lever of a payload.
+lies up to some centimetres aside of the simulated one, which is a lever of a payload. At random poses of rods
+100 to 104, 500 g are told with RMS errors of 23 to 47 g; without this part of e, 26 to 61 g.
 
 What is left of e is a factor that is alike for all chambers and for poses that are alike. Poses with a known
 weight tell it (`weighed`).
