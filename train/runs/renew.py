@@ -42,7 +42,9 @@ def told_enough(before: Run, now: Run, calibration: Path, console: Console) -> b
 
     Goals are corrected as by the control loop: an error of the policy that the loop removes matters little.
     On the arm, the error of the sim-to-real network adds to that in simulation. Chambers at a limit count by
-    the error that they make.
+    the error that they make. Policies of twins 0 to 2, each with the calibration of another twin, are expected
+    to be 0.6, 0.6, 3.7, 4.3, 9.2 and 13.2 mm off in the median. On the circle of that twin they are 0.7, 0.7,
+    4.4, 5.7, 12.1 and 14.4 mm off. Without the correction, simulation says 17 to 42 mm.
 
     Args:
         before: the run.
