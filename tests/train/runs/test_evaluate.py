@@ -112,16 +112,20 @@ class Tip(NamedTuple):
     pressure_kpa: jax.Array = jnp.zeros(1)
 
 
+LIMIT = np.repeat([25.0, 5.0], 3)
+
+
 @pytest.mark.parametrize(
-    ("limit", "left"),
+    ("limit", "reward", "left"),
     [
-        (evaluate.UNCORRECTED, [12.0, -4.0, 0.0, 6.0, 0.0, 0.0]),
-        (np.repeat([25.0, 5.0], 3), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
-        (np.repeat([10.0, 9.0], 3), [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        (evaluate.UNCORRECTED, RewardConfig(), [12.0, -4.0, 0.0, 6.0, 0.0, 0.0]),
+        (LIMIT, RewardConfig(), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
+        (np.repeat([10.0, 9.0], 3), RewardConfig(), [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        (LIMIT, RewardConfig(axes=(1.0, 0.0, 1.0, 1.0, 1.0, 1.0)), [0.0, -4.0, 0.0, 1.0, 0.0, 0.0]),
     ],
 )
-def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, left):
-    away, reward = jnp.array([12.0, -4.0, 0.0, 6.0, 0.0, 0.0]), RewardConfig()
+def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, reward, left):
+    away = jnp.array([12.0, -4.0, 0.0, 6.0, 0.0, 0.0])
 
     def step(state, action):
         return state.replace(pipeline_state=state.pipeline_state._replace(pose=action + away))
@@ -138,6 +142,19 @@ def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, left):
     _, found = reach(env, obedient, None, begin, goal, 3, limit)
     np.testing.assert_allclose(found.pose - goal, left, atol=1e-4)
     np.testing.assert_array_equal(found.goal, goal)
+
+
+def test_an_evaluation_corrects_each_goal_of_a_path(short_env, actions, monkeypatch):
+    def limited(env, learner, policy, state, goal, n_actions, shift_limit, take=reach):
+        after, result = take(env, learner, policy, state, goal, n_actions, shift_limit)
+        return after, result._replace(near_s=shift_limit[0])
+
+    monkeypatch.setattr(evaluate, "reach", limited)
+    goals = short_env.pool.pose[:64]
+    plain = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals))
+    corrected = plain.on(short_env, 1, LIMIT)
+    corrected.goals = jnp.concatenate([goals, goals])
+    assert (corrected(actions)[1].near_s == LIMIT[0]).all()
 
 
 def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():
