@@ -103,7 +103,7 @@ class Evaluator:
 
     Every goal gets `n_actions` of the deterministic policy, and the state after the last counts. Each of many
     arms goes from goal to goal of its part of the workspace. One goes twice around the circle, and its second
-    lap counts. Goals are corrected as by the control loop, by `shift_limit` (6,) [mm, deg] at most.
+    lap counts. `shift_limit` (6,) [mm, deg] limits how goals are corrected, see `reach`.
     """
 
     def __init__(

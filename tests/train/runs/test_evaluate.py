@@ -144,17 +144,12 @@ def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, reward, left):
     np.testing.assert_array_equal(found.goal, goal)
 
 
-def test_an_evaluation_corrects_each_goal_of_a_path(short_env, actions, monkeypatch):
-    def limited(env, learner, policy, state, goal, n_actions, shift_limit, take=reach):
-        after, result = take(env, learner, policy, state, goal, n_actions, shift_limit)
-        return after, result._replace(near_s=shift_limit[0])
-
-    monkeypatch.setattr(evaluate, "reach", limited)
+def test_an_evaluation_corrects_each_goal_of_a_path(short_env, actions, shift_limit):
     goals = short_env.pool.pose[:64]
     plain = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals))
-    corrected = plain.on(short_env, 1, LIMIT)
+    corrected = plain.on(short_env, 1, shift_limit)
     corrected.goals = jnp.concatenate([goals, goals])
-    assert (corrected(actions)[1].near_s == LIMIT[0]).all()
+    assert (corrected(actions)[1].near_s == shift_limit[0]).all()
 
 
 def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():

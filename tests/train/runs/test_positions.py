@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import Randomisation, ReachEnv
-from train.runs import evaluate
 from train.runs.evaluate import Reached
 from train.runs.positions import N_STARTS, PositionEvaluator, summarise
 
@@ -116,12 +115,6 @@ def test_a_position_counts_as_saturated_or_outside_from_any_start():
     assert figures.held_share == pytest.approx(5 / 6) and at.success.sum() == 1
 
 
-def test_an_evaluation_at_rest_corrects_positions(short_env, evaluator, shown, monkeypatch):
-    def limited(env, learner, policy, state, goal, n_actions, shift_limit, take=evaluate.reach):
-        after, result = take(env, learner, policy, state, goal, n_actions, shift_limit)
-        return after, result._replace(near_s=shift_limit[0])
-
-    monkeypatch.setattr(evaluate, "reach", limited)
-    limit = np.repeat([25.0, 5.0], 3)
-    found = evaluator(short_env).on(short_env, 1, limit)(0.0)[1]
-    assert (found.reached.near_s == limit[0]).all()
+def test_an_evaluation_at_rest_corrects_positions(short_env, evaluator, shift_limit):
+    found = evaluator(short_env).on(short_env, 1, shift_limit)(0.0)[1]
+    assert (found.reached.near_s == shift_limit[0]).all()
