@@ -78,7 +78,6 @@ class EnvConfig:
     0.02 by mjx"""
     pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
     """cross-shaped pipe around the arm"""
-    pipe_lip_mm: float = 0.0  # length of the plates that hang from the upper edges of its side branches
     pipe_contact: bool = False
     """the wall acts on the simulated arm; else it is there for clearances alone"""
     clearance_cost_per_mm: float = 0.0  # cost per mm of clearance below the margin
@@ -87,9 +86,7 @@ class EnvConfig:
     @property
     def pipe(self) -> CrossPipe | None:
         """Pipe around the arm, if there is one."""
-        if self.pipe_diameter_mm is None:
-            return None
-        return CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)
+        return None if self.pipe_diameter_mm is None else CrossPipe.of_mm(self.pipe_diameter_mm)
 
     def contact(self, spec: ArmSpec) -> Contact | None:
         """Return the contact of an arm with the pipe, if its wall acts."""
@@ -155,7 +152,7 @@ class EnvConfig:
         _expect(self.randomisation, "friction_max_n", no_friction, "0 with the engine 'warp'")
 
         # Pipe
-        for name in ("clearance_cost_per_mm", "pipe_lip_mm", "pipe_contact"):
+        for name in ("clearance_cost_per_mm", "pipe_contact"):
             without = self.pipe_diameter_mm is not None or not getattr(self, name)
             _expect(self, name, without, f"{type(getattr(self, name))()!r} without a pipe_diameter_mm")
         other_engine = self.engine != ("mjx" if self.moves else "chain")
@@ -166,4 +163,4 @@ class EnvConfig:
             f"False with the engine {self.engine!r} and the mode {self.mode!r}",
         )
         if self.pipe_diameter_mm is not None:
-            CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)  # raises ValueError
+            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError
