@@ -37,8 +37,7 @@ from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, extrapolation
-from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import Unmodelled
+from mjx_softarm.spec import ArmSpec, Unmodelled
 
 MIN_S2R_POSES = 60
 NOT_FITTED = "Not fitted: the specification's values stay."

@@ -39,8 +39,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import LEAST_CHAMBERS
+from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
 
 AT_LIMIT_KPA = 0.2  # distance to a limit at which a measured, noisy pressure counts as at it
 TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference; a run may set another

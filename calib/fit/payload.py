@@ -197,7 +197,7 @@ def weighed(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> Weighed
     # Tell the weights by what pressures remain
     weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
     kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
-    kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)[rows] - spec.unmodelled_kpa(spring_m)
+    kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)[rows] - spec.unmodelled_kpa
     told_kg, _ = told_payload(arm, spring_m, kpa)
     # Least squares for their ratio, with a prior: what a weight can tell of a factor's deviation
     information, prior = np.sum(weight_kg**2), COMMON_FACTOR**2 - LEFT_FACTOR**2

@@ -170,13 +170,13 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
     assert found.factor_sd == pytest.approx(0.03)
     loaded = jax.device_get(sample_workspace(SPEC.replace(mass={"payload_kg": 0.45}), N_ARMS, 79))
     for arms, payload_kg in ((others, 0.0), (loaded, 0.5)):
-        kpa = arms.pressure_kpa + hardening(arms.spring_m) + spec.unmodelled_kpa(arms.spring_m)
+        kpa = arms.pressure_kpa + hardening(arms.spring_m) + spec.unmodelled_kpa
         models = distilled.load_estimator, found
         told_kg, half_width_kg = np.array(
             [estimate_load(model, arms.spring_m, kpa) for model in models]
         ).swapaxes(0, 1)
         off_kg = np.abs(told_kg - payload_kg)
         assert np.median(off_kg[1]) < 0.08 and np.median(off_kg[0]) > 1.5 * np.median(off_kg[1])
-        exact_kg, _ = told_payload(arm, arms.spring_m, kpa - spec.unmodelled_kpa(arms.spring_m))
+        exact_kg, _ = told_payload(arm, arms.spring_m, kpa - spec.unmodelled_kpa)
         assert np.sqrt(np.mean((told_kg[1] - exact_kg) ** 2)) < 0.03  # 0.003 after all of the training
         assert np.mean(off_kg[1] < half_width_kg[1]) > 0.9 and np.median(half_width_kg[1]) < 0.3
