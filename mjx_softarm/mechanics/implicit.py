@@ -18,7 +18,7 @@ of the law's gain l as well, where chambers track. They are at rest, but the joi
 
     dq = K dp + H^-1 S^T l (dreference - d_x s) - H^-1 d_x grad V,    with r less S times the last two terms.
 
-Redundant chambers close the errors of `mjx_softarm.mechanics.newton`: C S in place of S,
+Redundant chambers close the errors of `mjx_softarm.mechanics.settle`: C S in place of S,
 C (dreference - d_x s) in place of dreference - d_x s, and C S K + YIELD_M_PER_KPA N in place of S K.
 
 This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step; only
@@ -35,7 +35,7 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from mjx_softarm._support.small_matrices import block_diagonal, eliminate
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import Statics, statics
 
@@ -94,16 +94,16 @@ def equilibrium_tangents(
     """Differentiate an equilibrium along a direction.
 
     Args:
-        primals: kinematics, params (`ArmParams`) and reference_m (n_springs,) of `settle`.
+        primals: params (`ArmParams`) and reference_m (n_springs,) of `settle`.
         tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
         end: the equilibrium.
         settled () bool: false for a zero derivative.
     """
     # Derivatives at fixed joint coordinates and pressures
-    _, params, reference = primals
-    _, params_dot, reference_dot = tangents
+    params, reference = primals
+    params_dot, reference_dot = tangents
     q, pressure_kpa, at_limit, frames, here, response, by_law = end
-    explicit = _explicit_tangents(primals, tangents, q, pressure_kpa)
+    explicit = _explicit_tangents(params, params_dot, q, pressure_kpa)
 
     # Inverse of the chambers' equations
     dq_dp = _masked(response.dq_dp, settled)
@@ -151,11 +151,13 @@ class _Explicit(NamedTuple):
     tip_rotation: Array  # (3, 3)
 
 
-def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: Array) -> _Explicit | None:
+def _explicit_tangents(
+    params: ArmParams, params_dot: ArmParams, q: Array, pressure_kpa: Array
+) -> _Explicit | None:
     """Differentiate along the arm's numbers, pressure limits aside; None where none of them changes."""
     # Numbers that change; all others stay constants of the differentiated function
-    numbers, structure = jax.tree.flatten(_without_limits(primals))
-    directions = jax.tree.leaves(_without_limits(tangents))
+    numbers, structure = jax.tree.flatten(_without_limits(params))
+    directions = jax.tree.leaves(_without_limits(params_dot))
     changing = [k for k, direction in enumerate(directions) if not isinstance(direction, SymbolicZero)]
     if not changing:
         return None
@@ -164,18 +166,17 @@ def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: 
         merged = list(numbers)
         for k, value in zip(changing, values, strict=True):
             merged[k] = value
-        kinematics, params = jax.tree.unflatten(structure, merged)
-        frames = kinematics(q)
-        here = statics(frames, q, pressure_kpa, params)
+        arm = jax.tree.unflatten(structure, merged)
+        frames = chain_kinematics(arm)(q)
+        here = statics(frames, q, pressure_kpa, arm)
         return _Explicit(here.gradient, here.springs.length, frames.tip_position, frames.tip_rotation)
 
     return jax.jvp(observables, [numbers[k] for k in changing], [directions[k] for k in changing])[1]
 
 
-def _without_limits(arguments: tuple) -> tuple:
-    """Return kinematics and parameters without the numbers that V does not contain."""
-    kinematics, params, _ = arguments
-    return kinematics, params._replace(pressure_min_kpa=None, pressure_max_kpa=None, allocation=None)
+def _without_limits(params: ArmParams) -> ArmParams:
+    """Return parameters without the numbers that V does not contain."""
+    return params._replace(pressure_min_kpa=None, pressure_max_kpa=None, allocation=None)  # type: ignore
 
 
 def _array(tangent: Array | SymbolicZero, primal: Array) -> Array:

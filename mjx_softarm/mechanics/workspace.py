@@ -14,7 +14,6 @@ from jax import Array
 
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.settle import Settled, arms_at_once, settle, settle_pressures
 from mjx_softarm.posture import hangs
@@ -54,7 +53,7 @@ def _solver(n_at_once: int | None):
     """Return the compiled equilibria of arms with the same parameters, pressures (n, n_chambers)."""
 
     def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
-        return settle_pressures(chain_kinematics(params), params, pressure_kpa, n_at_once)
+        return settle_pressures(params, pressure_kpa, n_at_once)
 
     return xla.jit(jax.vmap(solve, in_axes=(None, 0)))
 
@@ -71,11 +70,10 @@ def _loaded_solver(n_at_once: int | None, by_law: bool = False):
     ) -> Settled:
         own = params.stiffened(stiffness)._replace(area=params.area * area)
         loaded = own._replace(tool_mass_kg=jnp.asarray(own.tool_mass_kg).at[PAYLOAD].set(load_kg))
-        kinematics = chain_kinematics(own)
         if not by_law:
-            return settle_pressures(kinematics, loaded, pressure_kpa, n_at_once)
-        unloaded = settle_pressures(kinematics, own, pressure_kpa, n_at_once)
-        found = settle(kinematics, loaded, unloaded.spring_m, n_at_once)
+            return settle_pressures(loaded, pressure_kpa, n_at_once)
+        unloaded = settle_pressures(own, pressure_kpa, n_at_once)
+        found = settle(loaded, unloaded.spring_m, n_at_once)
         return found._replace(result=jnp.maximum(found.result, unloaded.result))
 
     return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)))

@@ -43,7 +43,7 @@ def least_curvature(spec, found):
 @jax.jit
 @functools.partial(jax.vmap, in_axes=(0, None))
 def solve(reference, params):
-    return settle(chain_kinematics(params), params, reference)
+    return settle(params, reference)
 
 
 def settled(spec, reference_m):
@@ -90,7 +90,7 @@ def test_derivatives_of_arms_that_the_law_holds_are_those_of_differences():
         def tips(change):
             """Arms whose references [mm] and stiffnesses [%] change by (2, 9)."""
             arm = params._replace(chamber_stiffness=params.chamber_stiffness * (1.0 + 0.01 * change[1]))
-            hold = functools.partial(settle, chain_kinematics(arm), arm)
+            hold = functools.partial(settle, arm)
             return jax.vmap(hold)(reference_m + 1e-3 * change[0])
 
         def along(direction):
