@@ -93,7 +93,7 @@ def test_goals_of_their_own_would_have_given_what_the_environment_gave(played, m
 
 def test_goals_near_the_pose_reached_are_as_many_and_as_far_as_asked_for(played, monkeypatch):
     buffer, where = played.buffer, [np.tile(index, 50) for index in played.where]
-    near = HindsightConfig(reached_share=0.25, near_share=0.5, near_min_mm=2.0, near_max_mm=20.0)
+    near = HindsightConfig(reached_share=0.25, near_share=0.5)
     monkeypatch.setattr(buffer, "_hindsight", near)
     monkeypatch.setattr(
         buffer, "_sample_goals", lambda *where: buffer.next_observations["achieved_goal"][where]
