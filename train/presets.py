@@ -30,7 +30,7 @@ _TUNED = TQCConfig(
 # goals uniform in volume are within 3.8 mm, of those of random pressures 0.75; with four fifths 2.9 and 0.79.
 # `payload` has more to learn: halfway through a training its circle is 0.51 mm off with these, 0.32 with
 # half.
-_EVEN = EnvConfig(n_poses=4_096, even_share=0.8)
+_EVEN = EnvConfig(engine="chain", n_poses=4_096, even_share=0.8)  # the learner descends its gradient
 _MOVING = EnvConfig(
     mode="dynamic",
     observation="motion",

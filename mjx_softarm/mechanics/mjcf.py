@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from mjx_softarm._support.lazy import mujoco
+from mjx_softarm._support.lazy import mjx, mujoco
 from mjx_softarm._support.xp import Array
 from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
 from mjx_softarm.mechanics.params import ArmParams
@@ -86,6 +87,17 @@ def spring_lengths(data: Any, n_chambers: int) -> Array:
 def build_model(spec: ArmSpec) -> mujoco.MjModel:
     """Return the compiled model of an arm."""
     return build_spec(spec).compile()
+
+
+def episode_model(model: mjx.Model, params: ArmParams) -> mjx.Model:
+    """Return a model on the device with the masses and the tendons' stiffnesses of `params`."""
+    mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
+    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
+    return model.replace(
+        body_mass=mass,
+        body_inertia=model.body_inertia * scale[:, None],
+        tendon_stiffness=jnp.concatenate([params.chamber_stiffness, params.spring_stiffness]),
+    )
 
 
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):

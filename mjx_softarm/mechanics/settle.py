@@ -51,6 +51,7 @@ class SettleResult(Result):
         "do not follow its chambers",
     )
     NOT_FINITE = 3, "a force or a length is not a finite number"
+    UNBALANCED = 4, "MJX's own forces do not balance at the equilibrium of the closed form"
 
 
 class Settled(NamedTuple):

@@ -20,6 +20,7 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.instruments import (
@@ -31,7 +32,7 @@ from mjx_softarm.twin.instruments import (
     checked_payload,
     checked_pressures,
 )
-from mjx_softarm.twin.model import build_twin, draw_parts, rotation_matrix
+from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 
 # Losses of the paper's arm.
@@ -159,9 +160,7 @@ class Twin(InstrumentedArm):
         tip_m, tip = self.tip()
 
         def turned(vector_rad: np.ndarray) -> np.ndarray:
-            quaternion = np.zeros(4)
-            mujoco.mju_mat2Quat(quaternion, (rotation_matrix(vector_rad) @ tip).ravel())
-            return quaternion
+            return quaternion_from_rotation(rotation_about(vector_rad) @ tip)
 
         return self._seen(tip_m, turned, marker_m)
 

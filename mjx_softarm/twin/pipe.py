@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from mjx_softarm.mechanics.body import gripper_boxes, rim_points, ring_radius_m
-from mjx_softarm.mechanics.pipe import LIP_HALF_M, CrossPipe
+from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.spec import ArmSpec
 
 N_PLANKS = 24  # planks around a branch; a multiple of four puts none across the plane of the two axes
@@ -99,13 +99,6 @@ def _walls(pipe: CrossPipe):
             corners = [np.stack(place(across, y, along), axis=-1) for along in ends]
             group = 0 if sin > 0.0 else _UNSEEN
             yield f"{WALL}_{branch}{k}", centre + np.concatenate(corners), _WALL_COLOUR, group
-    # Lips, each in two halves.
-    top = pipe.centre_z_m + pipe.radius_m
-    for side, half in itertools.product((-1.0, 1.0), (-1.0, 1.0)) if pipe.lip_m else ():
-        x = side * (pipe.radius_m + 2.0 * LIP_HALF_M * np.array([0.0, 1.0]))
-        y, z = half * np.array([0.0, pipe.radius_m]), (top - pipe.lip_m, top)
-        corners = np.array([*itertools.product(x, y, z)])
-        yield f"{WALL}_lip{side:+g}{half:+g}", corners, _WALL_COLOUR, 0 if half > 0.0 else _UNSEEN
 
 
 def _containers(pipe: CrossPipe):

@@ -26,12 +26,12 @@ from mjx_softarm.mechanics.motion import midpoint
 from mjx_softarm.mechanics.motion.state import Motion, MotionParams, MovingArm
 from mjx_softarm.mechanics.newton import MAX_ITERATIONS_IN_CONTACT
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.pipe import Contact, CrossPipe, clearance, lip_distance
+from mjx_softarm.mechanics.pipe import Contact, CrossPipe, clearance
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, SettleResult, settle
 from mjx_softarm.mechanics.statics import statics
 
 SPEC = ArmSpec.default()
-PIPE = CrossPipe.of_mm(250.0, lip_mm=80.0)
+PIPE = CrossPipe.of_mm(250.0)
 CONTACT = Contact.of(PIPE, SPEC)
 R, Z = PIPE.radius_m, PIPE.centre_z_m
 N = 128
@@ -66,14 +66,10 @@ def settled():
 def energy(q):
     """Energy of the contact by its definition: the integral of each ball's force over its depth."""
     centre = ball_centres(CONTACT, chain_kinematics(params_of(np.float64))(q))
-    radius = jnp.array(CONTACT.radius_m)
-    to_lip = lip_distance(PIPE, jnp.moveaxis(centre, 0, -1))
-    total = 0.0
-    for distance in (pipe_distance(PIPE, centre), to_lip):
-        depth = jnp.maximum(radius - distance, 0.0)
-        ramp = jnp.minimum(depth, RAMP_M)
-        total += jnp.sum(ramp**3 / (6 * RAMP_M) + (depth - ramp) * (depth + ramp - RAMP_M) / 2)
-    return STIFFNESS_N_PER_M * total
+    depth = jnp.maximum(jnp.array(CONTACT.radius_m) - pipe_distance(PIPE, centre), 0.0)
+    ramp = jnp.minimum(depth, RAMP_M)
+    beyond = (depth - ramp) * (depth + ramp - RAMP_M) / 2
+    return STIFFNESS_N_PER_M * jnp.sum(ramp**3 / (6 * RAMP_M) + beyond)
 
 
 def test_the_distance_to_the_wall_is_that_to_its_nearest_point():
@@ -82,10 +78,9 @@ def test_the_distance_to_the_wall_is_that_to_its_nearest_point():
     across, y = R * np.cos(angle), R * np.sin(angle)
     both = [np.stack(at, -1).reshape(-1, 3) for at in ((across, y, along), (along, y, across))]
     wall = np.concatenate(both) + [0.0, 0.0, Z]
-    smooth = CrossPipe.of_mm(250.0)
     point = [0.0, 0.0, Z] + np.random.default_rng(0).uniform(-0.17, 0.17, (3000, 3))
-    point = point[clearance(smooth, point) > 0.02]
-    expected, _ = cKDTree(wall[clearance(smooth, wall) < 1e-9]).query(point)
+    point = point[clearance(PIPE, point) > 0.02]
+    expected, _ = cKDTree(wall[clearance(PIPE, wall) < 1e-9]).query(point)
     off = np.abs(pipe_distance(PIPE, jnp.array(point.T)) - expected)[expected < 0.075]  # rings: 69 mm
     assert len(off) > 500 and np.quantile(off, 0.97) < 2e-3 and off.max() < 5e-3
 

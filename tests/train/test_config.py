@@ -14,11 +14,11 @@ from train.presets import IMITATION_PRESETS, PRESETS
 
 def test_overrides_reach_every_level_and_leave_the_preset_alone():
     before = PRESETS["quick"]
-    after = override(before, ["seed=3", "learner.gamma=0.25", "learner.hidden=[64, 32]", "env.engine=mjx"])
+    after = override(before, ["seed=3", "learner.gamma=0.25", "learner.hidden=[64, 32]", "env.engine=chain"])
     got = (after.seed, after.learner.gamma, after.learner.hidden, after.env.engine)
     assert got == (3, 0.25, (64, 32), "mjx")
     assert override(after, ["env.reward.threshold=1"]).env.reward.threshold == 1.0
-    assert before.seed == 0 and before.env.engine == "chain"
+    assert before.seed == 0 and before.env.engine == "mjx"
 
 
 @pytest.mark.parametrize(

@@ -77,8 +77,9 @@ class AnalyticConfig(LearnerConfig):
 
     def check(self, env: EnvConfig) -> None:
         """Raise ValueError for MJX's own time step in motion: its gradient is neither tested nor cheap."""
-        usable = env.engine == "chain" or not env.moves
-        check_settings("env", env, {"engine": (usable, "'chain' in motion, for the gradient")})
+        engine = "mjx" if env.moves else "chain"
+        usable = env.engine == engine
+        check_settings("env", env, {"engine": (usable, f"{engine!r}, whose gradient this learner takes")})
 
 
 class AnalyticState(NamedTuple):
