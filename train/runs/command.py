@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.export.write import export_cpp, export_onnx
@@ -28,7 +29,7 @@ from train.runs import run as runs
 from train.runs.arm_model import arm_model
 from train.runs.checkpoint import RunError
 from train.runs.evaluate import N_ACTIONS
-from train.runs.export import check_policy, export_run
+from train.runs.export import check_policy, export_run, export_weights
 from train.runs.folder import Run
 from train.runs.lock import sole_trainer
 from train.runs.renew import renewed, told_enough
@@ -192,6 +193,7 @@ def export(
     onnx: bool = False,
     cpp: cli.MaybePath = None,
     calibration: cli.MaybePath = None,
+    weights: cli.MaybePath = None,
 ) -> int:
     """Write policies as npz files, and for other runtimes.
 
@@ -201,10 +203,20 @@ def export(
         cpp: folder for a C++ header, programs and golden rows, for one run
         calibration: later calibration of the same arm, whose models the policies get without training; None
             for the file means policy-NAME.npz after this folder. Exit status 1 if a policy needs training
+        weights: file for the actor alone, of one run; nothing is distilled, and nothing else written
     """
-    if not folders or ((out or cpp) and len(folders) > 1):
-        expected = "one folder of a run" + ("" if out or cpp else " or more")
+    if not folders or ((out or cpp or weights) and len(folders) > 1):
+        expected = "one folder of a run" + ("" if out or cpp or weights else " or more")
         raise RunError(f"RUN: got {len(folders)}, expected {expected}")
+    if weights:
+        if out or onnx or cpp or calibration:
+            raise InputError(
+                "--weights: got it with --out, --onnx, --cpp or --calibration, expected it alone"
+            )
+        (folder,) = folders
+        export_weights(Run.open(folder), weights)
+        print(f"weights: {weights}, {weights.stat().st_size / 1024:.0f} KiB")
+        return 0
     console, enough = start(), True
     for path in folders:
         run, file, keeps = Run.open(path), out, path
