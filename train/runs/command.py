@@ -46,8 +46,8 @@ class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""
 
     agent: cli.MaybePath = None
-    """run whose actor and critics this one begins with; in motion, only the policy, which TQC keeps to while
-    its critics learn. The widths of its hidden layers are taken, too"""
+    """run whose policy this one begins with, and whose critics if both learn by TQC. The widths of its hidden
+    layers are taken, too"""
     devices: Devices = None
 
     def __call__(self) -> int:
@@ -57,8 +57,6 @@ class Reach(ReachOptions):
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
         agent = Run.open(self.agent) if self.agent else None
-        if getattr(self.config.learner, "from_policy", False) and not (agent and self.config.env.moves):
-            raise ConfigError("learner.from_policy: got true, expected it only with --agent RUN, in motion")
         config = self.config.with_policy_of(agent.config) if agent else self.config
         arm = self.read_arm(console)
         console.print("drawing goals from the reachable workspace ...")
@@ -85,9 +83,8 @@ class Imitate(NewRunOptions):
     file: tyro.conf.Positional[cli.MaybePath] = None
     """demonstrations as `demos record` writes them"""
     preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
-    """settings to begin with. pipe: the learned reward; pipe-moving: the learned reward on arms in motion;
-    circle: the learned reward and the environment's, in two stages; paper-circle, paper-pipe: the paper's own
-    recipe"""
+    """settings to begin with. pipe: the learned reward; circle: the learned reward and the environment's, in
+    two stages; paper-circle, paper-pipe: the paper's own recipe"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""
@@ -163,6 +160,8 @@ def evaluate(
     n_actions = actions or N_ACTIONS
     console = start()
     opened = Run.open(run)
+    if in_motion is not None and opened.demonstrations():
+        raise ConfigError("--in-motion: got a run of `imitate`, expected one of `reach`")
     task, policy = runs.task_of_run(opened), opened.policy()
     if in_motion is None and not payload:
         _show(opened, task, runs.finish(opened, task, policy), console)
