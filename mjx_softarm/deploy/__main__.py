@@ -6,11 +6,11 @@ However a command ends, the arm is vented and what was logged is written.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -28,10 +28,9 @@ from mjx_softarm.deploy.accuracy.measure import (
     write_accuracy,
 )
 from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
-from mjx_softarm.deploy.controller import LOOP, Controller
-from mjx_softarm.deploy.drivers.driven import Arms, finish
-from mjx_softarm.deploy.drivers.names import twin_spec
-from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
+from mjx_softarm.deploy.capture import CapturedArm, with_capture
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.drivers.names import check_arm, check_number, open_arm, twin_spec
 from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
 from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.record import record
@@ -66,12 +65,40 @@ PolicyFile = Annotated[
         help_behavior_hint="(default: the package's own, for the paper's arm)",
     ),
 ]
-GoOn = Annotated[
-    bool,
+Arm = Annotated[
+    str,
     tyro.conf.arg(
-        help="go on without the first chamber that loses its pressure, with the others, instead of venting"
+        help="yours: package.module:Class, or a file of hardware, wiring.toml; simulated: twin:SEED, or "
+        "twin:rod:SEED; twin:SEED@ARM.toml, of another arm; twin:SEED:pipe300, in a pipe; "
+        "twin:SEED:aged, later; twin:SEED:exact, as specified; twin:SEED:500g, with a payload"
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """Options of a command that drives an arm: the arm, and motion capture beside its driver."""
+
+    arm: Arm
+    capture: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="SYSTEM:HOST:BODY",
+            help="natnet:HOST:BODY or qualisys:HOST:BODY, for an arm whose driver has no motion capture; "
+            "options: ,base=BODY,markers=NAME,up=y|z",
+        ),
+    ] = None
+
+    def open(self, spec: ArmSpec, tell: Callable[[str], None]) -> Any:
+        """Open the driver of an arm with this specification, and its motion capture, which reports its gaps.
+
+        Raises:
+            InputError: one of them cannot be had.
+        """
+        return with_capture(open_arm(self.arm), self.capture, spec, tell)
+
+
+Arms = Annotated[ArmOptions, tyro.conf.arg(name="")]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -87,7 +114,6 @@ def _run(
     log: cli.MaybePath = None,
     duration: float = np.inf,
     stay: bool = False,
-    go_on: GoOn = False,
 ) -> int:
     """Bring the tip to goals; errors are by motion capture if the arm has it.
 
@@ -103,7 +129,7 @@ def _run(
         raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
-    controller = _controller(policy, go_on)
+    controller = _controller(policy)
     goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
     driver = on.open(controller.policy.spec, tell)
@@ -120,10 +146,10 @@ def _run(
     return run.status
 
 
-def _controller(policy: Path, go_on: bool) -> Controller:
+def _controller(policy: Path) -> Controller:
     if policy == SHIPPED:
         tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
-    return Controller.of(load_policy(policy), config=replace(LOOP, go_on=go_on))
+    return Controller.of(load_policy(policy))
 
 
 def _measure(
@@ -134,7 +160,6 @@ def _measure(
     points: int = 16,
     seconds: float | None = None,
     payload: float = 0.0,
-    go_on: GoOn = False,
 ) -> int:
     """Measure a policy's accuracy on an arm with motion capture, and say what makes the error.
 
@@ -150,13 +175,9 @@ def _measure(
         raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
-    if seconds is not None and go_on:
-        raise InputError(
-            f"--go-on: got --seconds {seconds:g}, expected stops: a goal that moves does not wait"
-        )
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
-    controller = _controller(policy, go_on)
+    controller = _controller(policy)
     poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
@@ -266,6 +287,12 @@ def _record(
     if result.ending.cause:
         print(f"ended early: {result.ending.cause}", file=sys.stderr)
     return result.ending.status
+
+
+def finish(driver: Any, tell: Callable[[str], None]) -> None:
+    """End the motion capture that `--capture` began, and report its frames in a line."""
+    if isinstance(driver, CapturedArm):
+        tell(driver.finish())
 
 
 def tell(text: str) -> None:

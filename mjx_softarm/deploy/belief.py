@@ -18,14 +18,24 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import Allocation, Gains, allocated_error, at_chambers, saturated
-from mjx_softarm.deploy.controller import LOOP, Command, Controller, LoopConfig
+from mjx_softarm.deploy.controller import Command, Controller
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.lag import ARRIVED_M, still
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.hysteresis import stop_after
-from mjx_softarm.sensing.load import Load, averaged, estimate_load, holds_payload
+from mjx_softarm.sensing.load import KNOWN, Load, averaged, estimate_load, holds_payload
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 
+STUCK_RANGE_M = 1e-5  # range of a stuck sensor over a window; a live one's noise is larger
+STUCK_PRESSURE_KPA = 2.0  # range of its chamber's pressure at which a live one moves; by hand
+STUCK_NEIGHBOUR_M = 2e-3  # motion of its section's springs at which a live one moves; by hand
+
+# Lost chambers. By hand, and tested (tests/train/runs/test_estimator.py): no saturated simulated arm is taken
+# for one that leaks; 95 % of lost chambers are found, 85 % with 500 g.
+LOST_SHARE = 0.5  # least share of the pressure that the arm's shape lacks
+EXPLAINED_SHARE = 0.7  # least share of the springs' squared deviations that this explains
+LOST_EFFECT_M = 0.01  # least change at the chamber; tolerances and payloads look like less
 _NO_EFFECT_M2 = 1e-18
 
 
@@ -103,7 +113,7 @@ def believe(
     measured_kpa: np.ndarray | None = None,
 ) -> Belief:
     """Return the belief of a tick from the last one and the command in force; arguments as of `loop.step`."""
-    policy, config, size = controller.policy, controller.config, controller.window
+    policy, size = controller.policy, controller.window
     gains, tolerance_m = policy.gains, policy.tolerance_m
     in_force_kpa, asked_m = command.pressure_kpa, command.reference_m
 
@@ -120,18 +130,17 @@ def believe(
 
     # Rest, and trust in sensors and chambers
     if len(springs_m) == size:
-        at_rest = command.n_ticks >= size and bool(still(springs_m, config))
+        at_rest = command.n_ticks >= size and bool(still(springs_m, controller.rest.still_m))
         n_sections = policy.spec.structure.n_sections
-        stuck = stuck_springs(springs_m, window.pressure_kpa, n_sections, config)
+        stuck = stuck_springs(springs_m, window.pressure_kpa, n_sections)
         belief = replace(belief, at_rest=at_rest, stuck=stuck)
     if asked_m is not None and belief.known:
-        on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, config))
+        arrived_m = controller.rest.arrived_m
+        on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, arrived_m))
         mask = saturated(in_force_kpa, asked_m, mean_m, gains, tolerance_m)
-        # A chamber that is known to be lost has one pressure left
-        held = np.less(gains.pressure_min_kpa, gains.pressure_max_kpa)
-        suspect = held & saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
+        suspect = saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
         if suspect.any():
-            suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, config, gains.allocation)
+            suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, gains.allocation)
         belief = replace(belief, settled=on, saturated=mask, suspect=suspect)
 
     # Payload, of windows that do not overlap
@@ -157,7 +166,7 @@ def _weighed(
     estimate_kg, width_kg = map(float, estimate_load(model, mean_m, mean_kpa, stop))
     if not holds_payload(estimate_kg, width_kg, most_kg):
         return Load.assumed(load.assumed_kg), estimate_kg, width_kg
-    if width_kg > controller.config.load_known * most_kg:
+    if width_kg > KNOWN * most_kg:
         return load, estimate_kg, width_kg
     return averaged(load, estimate_kg, width_kg, most_kg), estimate_kg, width_kg
 
@@ -191,15 +200,8 @@ def read_lengths(
     return np.where(lost, last_m, reading.length_m), lost, text
 
 
-def still(spring_m: Array, config: LoopConfig = LOOP) -> Array:
-    """Return whether springs came to rest over a window (ticks, n) [m]: its halves have the same mean."""
-    xp, half = array_namespace(spring_m), len(spring_m) // 2
-    moved_m = xp.mean(spring_m[-half:], axis=0) - xp.mean(spring_m[:half], axis=0)  # (n,)
-    return xp.all(xp.abs(moved_m) < config.still_m)
-
-
 def on_reference(
-    springs_m: Array, reference_m: Array, pressure_kpa: Array, gains: Gains, config: LoopConfig = LOOP
+    springs_m: Array, reference_m: Array, pressure_kpa: Array, gains: Gains, arrived_m: float = ARRIVED_M
 ) -> Array:
     """Return whether each spring is on its reference, in the mean of a window, or its chamber at a limit.
 
@@ -211,17 +213,17 @@ def on_reference(
         reference_m (n_springs,) [m]: references.
         pressure_kpa (n_chambers,) [kPa]: commanded pressures.
         gains: numbers of the law.
-        config: limits.
+        arrived_m: largest error of a spring on its reference.
     """
     xp = array_namespace(springs_m, reference_m, pressure_kpa)
     off_m = xp.mean(springs_m, axis=0) - reference_m
     if gains.allocation is not None:
         off_m = allocated_error(-off_m, pressure_kpa, gains.allocation)
     at_limit = (pressure_kpa <= gains.pressure_min_kpa) | (pressure_kpa >= gains.pressure_max_kpa)
-    return xp.all((xp.abs(off_m) < config.arrived_m) | at_limit)
+    return xp.all((xp.abs(off_m) < arrived_m) | at_limit)
 
 
-def stuck_springs(spring_m: Array, pressure_kpa: Array, n_sections: int, config: LoopConfig = LOOP) -> Array:
+def stuck_springs(spring_m: Array, pressure_kpa: Array, n_sections: int) -> Array:
     """Return which springs (n_springs,) stand stock-still, noise included, where they should move.
 
     They should move if the chamber beside them was driven or a spring of their section moved.
@@ -230,14 +232,13 @@ def stuck_springs(spring_m: Array, pressure_kpa: Array, n_sections: int, config:
         spring_m (ticks, n_springs) [m]: lengths of the last ticks.
         pressure_kpa (ticks, n_chambers) [kPa]: commanded pressures of these ticks.
         n_sections: number of sections.
-        config: limits.
     """
     xp, n_springs = array_namespace(spring_m), spring_m.shape[1]
     beside_kpa = pressure_kpa[:, :: pressure_kpa.shape[1] // n_springs]  # every k-th chamber has a spring
-    driven = _range(beside_kpa) > config.stuck_pressure_kpa
+    driven = _range(beside_kpa) > STUCK_PRESSURE_KPA
     section_m = xp.max(_range(spring_m).reshape(n_sections, -1), axis=1)[:, None]  # (n_sections, 1)
     near_m = (section_m + np.zeros(n_springs // n_sections)).reshape(-1)  # (n_springs,)
-    return (_range(spring_m) < config.stuck_range_m) & (driven | (near_m > config.stuck_neighbour_m))
+    return (_range(spring_m) < STUCK_RANGE_M) & (driven | (near_m > STUCK_NEIGHBOUR_M))
 
 
 def _range(values: Array) -> Array:
@@ -250,7 +251,6 @@ def as_without(
     model: SpringModel,
     pressure_kpa: Array,
     spring_m: Array,
-    config: LoopConfig = LOOP,
     allocation: Allocation | None = None,
 ) -> Array:
     """Return for which chambers (n_chambers,) the springs lie as they would without that chamber's pressure.
@@ -264,7 +264,6 @@ def as_without(
         model: network of the unloaded arm.
         pressure_kpa (n_chambers,) [kPa]: commanded pressures.
         spring_m (n_springs,) [m]: lengths.
-        config: shares and effects that count.
         allocation: matrices of an arm with redundant chambers.
     """
     xp, own = array_namespace(pressure_kpa, spring_m), np.eye(len(pressure_kpa), dtype=bool)
@@ -278,5 +277,5 @@ def as_without(
     left_m = deviation_m - share[:, None] * effect_m
     explained = 1.0 - xp.sum(left_m**2, axis=1) / xp.sum(deviation_m**2)
     own_m = xp.abs(share * xp.sum(xp.where(own, at_chambers(effect_m, allocation), 0.0), axis=1))
-    enough = (share > config.lost_share) & (explained > config.explained_share)
-    return enough & (own_m > config.lost_effect_m)
+    enough = (share > LOST_SHARE) & (explained > EXPLAINED_SHARE)
+    return enough & (own_m > LOST_EFFECT_M)

@@ -9,7 +9,6 @@ import numpy as np
 
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.loop import LoopState, Tick, hold, release, with_goal
-from mjx_softarm.deploy.lost import GoalSearch
 from mjx_softarm.deploy.safety import Event
 
 Note = Callable[[Sequence[Event]], None]
@@ -31,7 +30,6 @@ class ListedGoals:
         self._controller, self._goals, self._refused = controller, list(goals), refused
         self._duration_s, self._began_s, self._stays, self._accepted = duration_s, np.nan, stay, False
         self.n_goals, self.n_taken = len(self._goals), 0
-        self._search: GoalSearch | None = None
 
     def advance(self, state: LoopState, now_s: float, row: int, note: Note) -> LoopState | None:
         """Return the state with the goal of a tick, None where the run is over.
@@ -48,20 +46,10 @@ class ListedGoals:
         ended = state.goal is None and self.n_taken == len(self._goals)
         return None if over or (ended and not (self._stays and self._accepted)) else state
 
-    def go_on(self, controller: Controller, search: GoalSearch, state: LoopState) -> LoopState:
-        """Take another controller and its search; return the state that begins its goal again."""
-        self._controller, self._search = controller, search
-        self.n_taken -= state.goal is not None
-        return state._replace(goal=None)
-
     def taken(self, state: LoopState, note: Note) -> LoopState:
-        """Return the state with the next accepted goal, if it has none; without during a search."""
+        """Return the state with the next accepted goal, if it has none."""
         while state.goal is None and self.n_taken < len(self._goals):
             goal, refusal = self._goals[self.n_taken], self._refused.get(self.n_taken)
-            if self._search and not refusal:
-                if not self._search.step(goal):
-                    return state
-                refusal = self._search.refusal()
             self.n_taken += 1
             events = (refusal,) if refusal else ()
             if not refusal:

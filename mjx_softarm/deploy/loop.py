@@ -6,7 +6,7 @@
     belief, references  -> pressures     the sensor-space law (`mjx_softarm.control`)
 
 Each piece has a memory of its own; `LoopState` holds them side by side. Gains, limits, calibration, rate,
-tolerance and number of actions come from the policy file, heuristics from `LoopConfig`.
+tolerance and number of actions come from the policy file; heuristics are constants beside their use.
 """
 
 from __future__ import annotations

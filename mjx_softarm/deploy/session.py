@@ -19,9 +19,8 @@ from mjx_softarm.deploy.ending import Arrival, LoopRun, vent_at_end
 from mjx_softarm.deploy.goals import ListedGoals, OrderedGoals, Pilot
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, step
-from mjx_softarm.deploy.lost import begun_again, without
 from mjx_softarm.deploy.moving.way import Way
-from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, lost_chambers, names
+from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import weighted_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
@@ -187,21 +186,9 @@ class _Session:
             if tick.arrived:
                 self._arrive(row["goal"], row["estimate"])
             self.look(self.state, tick, row)
-        if tick.stop is not None and not self._goes_on(tick.stop):
+        if tick.stop is not None:
             raise _Stopped(self._at(f"{tick.stop.fault.value}: {tick.stop.message}"))
         return in_time
-
-    def _goes_on(self, stop: Event) -> bool:
-        """Go on without the chamber that was lost, if the controller may and goals stand still."""
-        goals, may = self.goals, self.controller.config.go_on and stop.fault is Fault.CHAMBER_LOST
-        if not may or not isinstance(goals, ListedGoals):
-            return False
-        lost = lost_chambers(self.controller, self.state.watch, self.state.belief)
-        self.tell(self._at(f"{stop.fault.value}: {stop.message} -> go on without {names('chamber', lost)}"))
-        self.controller, search = without(self.controller, lost)
-        again = begun_again(self.controller, self.state)
-        self.state = goals.go_on(self.controller, search, again)
-        return True
 
     def _log(self, row: dict[str, Any]) -> None:
         belief, reference_m = self.state.belief, self.state.command.reference_m

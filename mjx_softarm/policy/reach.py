@@ -78,19 +78,6 @@ def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array
     return best, weighted_error(best, goal, policy.reward)
 
 
-def best_of(policy: Policy, goal: np.ndarray, search: np.ndarray) -> np.ndarray:
-    """Return the best row (1, n + 1) of a search for one goal (1, 6) [mm, deg], to go on from."""
-    share = search[:, : policy.spec.n_chambers]
-    off = np.sum((_at(policy, share) - _target(policy, goal, len(share))) ** 2, axis=-1)
-    # Steps that no longer helped have raised the damping.
-    return np.append(share[np.argmin(off)], _FIRST_DAMPING)[None]
-
-
-def springs_of(policy: Policy, search: np.ndarray) -> np.ndarray:
-    """Return the spring lengths (rows, n_springs) [m] of the rows of a search."""
-    return np.asarray(_springs(policy, search[:, : policy.spec.n_chambers]), float)
-
-
 def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
     """Return the tip's position (..., 3) [m] and axes (..., 3, 3) at shares (..., n) of the pressures."""
     spring_m = _springs(policy, share)

@@ -7,14 +7,16 @@ import pytest
 
 from calib.read.logs import read_log
 from mjx_softarm.control import Gains
-from mjx_softarm.deploy import link
+from mjx_softarm.deploy import link, strategy
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.deploy.controller import LOOP, Controller
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import MISSED, Ending
 from mjx_softarm.deploy.loop import start, step, with_goal
+from mjx_softarm.deploy.moving import error
 from mjx_softarm.deploy.moving.way import on_the_way
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
+from mjx_softarm.deploy.strategy import N_CORRECTIONS
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.observation import layouts
@@ -78,7 +80,7 @@ def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():
     plan, asked = asking(exact_plan, arm)
     run = go(arm, goals=GOALS[:1], controller=Controller.of(OF_MOTION, plan))
     assert len(run.arrivals) == 1 and not run.events
-    assert [tick for *_, tick in asked] == [0, 15, 30] + (1 + LOOP.n_corrections) * [45]
+    assert [tick for *_, tick in asked] == [0, 15, 30] + (1 + N_CORRECTIONS) * [45]
     first, second = asked[0][3], asked[1][3]
     np.testing.assert_array_equal(first[9:21], 0.0)  # no rate of the springs, nor of the tip
     middle = 0.5 * (SPEC.springs.length_min_m + SPEC.springs.length_max_m)
@@ -123,12 +125,18 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     assert np.abs(early).max() > 1e-3
 
 
+@pytest.fixture
+def uncorrected(monkeypatch):
+    """Goals without corrections: the linear arm's poses are not those of its references."""
+    for module in (strategy, error):
+        monkeypatch.setattr(module, "SHIFT_LIMIT", np.zeros(6))
+
+
 @pytest.mark.parametrize("slower", [1.0, 4.0])
-def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower):
+def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower, uncorrected):
     spec = SPEC.replace(control={"ki_kpa_per_ms": SPEC.control.ki_kpa_per_ms / slower})
     policy = dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec))
-    config = dataclasses.replace(LOOP, max_shift=(0.0, 0.0))  # this arm's poses are not its references'
-    run = trace(LinearArm(noise_m=0.0), Controller.of(policy, between, config), GOALS[:2], pace_s=10.0)
+    run = trace(LinearArm(noise_m=0.0), Controller.of(policy, between), GOALS[:2], pace_s=10.0)
     rows = np.arange(run.ways[0].start, run.ways[0].stop)[300:480]
     due_m = [between(None, goal, None, None) for goal in run.log.goal[rows]]
     behind_m = np.abs(read_m(run.log)[rows] - due_m)
@@ -142,15 +150,14 @@ def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():
     )
     slow = Controller.of(dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec)))
     assert slow.window > 1.5 * CONTROLLER.window
-    assert slow.config.still_m == pytest.approx(0.5 * CONTROLLER.config.still_m) == 1e-4
-    assert slow.config.arrived_m == pytest.approx(0.5 * CONTROLLER.config.arrived_m) == 1.25e-4
+    assert slow.rest.still_m == pytest.approx(0.5 * CONTROLLER.rest.still_m) == 1e-4
+    assert slow.rest.arrived_m == pytest.approx(0.5 * CONTROLLER.rest.arrived_m) == 1.25e-4
 
 
-def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag():
-    config = dataclasses.replace(LOOP, way_share_per_s=0.0)  # this arm's poses are not its references'
+def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag(uncorrected):
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     plan, asked = asking(between, arm)
-    controller = Controller.of(OF_MOTION, plan, config)
+    controller = Controller.of(OF_MOTION, plan)
     run = trace(arm, controller, goals, pace_s=10.0)
     assert 0.2 < controller.lead_s < 2.0
     begun = run.ways[0].start

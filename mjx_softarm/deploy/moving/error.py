@@ -7,7 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.mdp.actions import SHIFT_LIMIT
 from mjx_softarm.mdp.rewards import asked_error
+
+# Share of the error along and beside the way by which the goal is corrected in a second. Circle in 20 s, a
+# policy of TQC in motion, which arrives early: 11.3 mm without, 5.3 mm with 0.6, 4.1 mm with this. At 2.5 per
+# second, policies trained at rest oscillate on rods.
+WAY_SHARE_PER_S = 1.0
 
 
 class WayError(NamedTuple):
@@ -23,7 +29,7 @@ class WayError(NamedTuple):
     def after(self, goal: np.ndarray, pose: np.ndarray, controller: Controller) -> WayError:
         """Return the memory a tick later, for a goal ahead (6,) and a believed pose now (6,) [mm, deg]."""
         # Wait until the goals reach back to the present one.
-        dt_s, lead_s, config = controller.dt_s, controller.lead_s, controller.config
+        dt_s, lead_s = controller.dt_s, controller.lead_s
         goals = (*self.goals, goal)[-round(lead_s / dt_s) - 3 :]
         if dt_s * (len(goals) - 3) < lead_s - 0.5 * dt_s:
             return WayError(goals)
@@ -31,8 +37,8 @@ class WayError(NamedTuple):
         before, last, now = goals[:3]
         kept_mm = _turned(self.correction_mm, (last - before)[:3], (now - last)[:3])
         error_mm = asked_error(pose, now, controller.policy.reward)[:3]
-        correction_mm = kept_mm - config.way_share_per_s * dt_s * error_mm
-        return WayError(goals, np.clip(correction_mm, -config.max_shift[0], config.max_shift[0]))
+        correction_mm = kept_mm - WAY_SHARE_PER_S * dt_s * error_mm
+        return WayError(goals, np.clip(correction_mm, -SHIFT_LIMIT[:3], SHIFT_LIMIT[:3]))
 
     @property
     def correction(self) -> np.ndarray:

@@ -17,6 +17,10 @@ from mjx_softarm.sensing.pose import pose_error
 # From pose and goal (6,), springs (n_springs,) [m] and `sensed` of `PolicyRunner.act` to references
 Plan = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
 
+# Time over which the rate of the references towards a moving goal is taken, for `spring_lag_s`, of policies
+# at rest
+RATE_S = 0.2
+
 # Goals that swing between two poses; by hand
 _N_SWINGS = 4
 _SWING_S = 10.0  # period; slow enough for the phase to be a lag

@@ -15,6 +15,7 @@ import numpy as np
 
 from mjx_softarm.deploy.belief import Belief, pose_of
 from mjx_softarm.deploy.moving.error import WayError
+from mjx_softarm.deploy.moving.lead import RATE_S
 from mjx_softarm.deploy.strategy import Choice, clipped, observed, planned
 from mjx_softarm.mdp.rewards import asked_error
 from mjx_softarm.policy.file import Policy
@@ -25,7 +26,7 @@ class Predicting(NamedTuple):
     """Actions of a policy for arms at rest towards a moving goal: all of them in each tick.
 
     The first one begins at the believed pose, each next one at the pose predicted for the last references.
-    The lengths at the goal are due half of `LoopConfig.rate_s` later. The references lead the lengths that
+    The lengths at the goal are due half of `RATE_S` later. The references lead the lengths that
     are due by the lag of the springs.
     """
 
@@ -46,11 +47,11 @@ class Predicting(NamedTuple):
             length_m = planned(belief, pose, goal + shift)
             pose, _ = pose_of(controller, length_m, belief.load)
             left = asked_error(np.asarray(pose, float), goal, policy.reward)
-            shift = clipped(shift - left, controller.config.shift_limit)
+            shift = clipped(shift - left)
         shape, behind = self.shape.after(policy, length_m, belief.load.believed_kg, controller.dt_s)
 
         # Lengths due now, their rate, and the lag of springs that move so
-        n_ticks = 2 * max(1, round(0.5 * controller.config.rate_s / controller.dt_s))
+        n_ticks = 2 * max(1, round(0.5 * RATE_S / controller.dt_s))
         lengths_m = (*self.lengths_m, length_m)[-n_ticks - 1 :]
         rate = (lengths_m[-1] - lengths_m[0]) / (controller.dt_s * max(len(lengths_m) - 1, 1))
         lag_s = spring_lag_s(policy, belief.command.pressure_kpa)
