@@ -17,24 +17,25 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.accuracy.budget import budget, draw
-from mjx_softarm.deploy.accuracy.measure import (
+from mjx_softarm.deploy.budget import budget, draw
+from mjx_softarm.deploy.capture import CapturedArm, with_capture
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.drivers.names import check_arm, check_number, open_arm, twin_spec
+from mjx_softarm.deploy.ending import MISSED, save_log
+from mjx_softarm.deploy.link import first_frame
+from mjx_softarm.deploy.measure import (
     along,
     figures,
     measure,
+    print_figures,
+    print_run,
     read_goals,
     ways_of,
     whole_goal,
     write_accuracy,
 )
-from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
-from mjx_softarm.deploy.capture import CapturedArm, with_capture
-from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drivers.names import check_arm, check_number, open_arm, twin_spec
-from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
-from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.session import follow, trace
+from mjx_softarm.deploy.session import LoopRun, follow, trace
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.logs.schema import Log
@@ -142,7 +143,7 @@ def _run(
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver, tell)
-    tell_run(run, controller.policy)
+    print_run(run, controller.policy)
     return run.status
 
 
@@ -202,7 +203,7 @@ def _measure(
     finish(driver, tell)
     if run.arrivals:
         _tell_measured(run, controller, poses, out, payload_kg if seconds is None else None)
-    tell_run(run, controller.policy)
+    print_run(run, controller.policy)
     return run.status
 
 
@@ -231,7 +232,7 @@ def _tell_measured(
         print(missing)
     elif split is not None:
         draw(split, out / "budget.png")
-    tell_accuracy(found)
+    print_figures(found)
     if split is not None:
         print("\n".join(split.lines()))
     print(f"figures: {out / 'accuracy.json'}")

@@ -55,12 +55,13 @@ class Belief:
     command: Command  # in force as the readings were taken
     window: Window
     spring_m: np.ndarray  # (n_springs,) lengths, the last good ones; NaN before the first
-    lost: np.ndarray  # (n_springs,) bool: a spring without a reading in this tick
+    n_lost: np.ndarray  # (n_springs,) ticks in a row without a reading of a spring
     stuck: np.ndarray  # (n_springs,) bool: a spring that stands stock-still where it should not
-    suspect: np.ndarray  # (n_chambers,) bool: a chamber that seems to have lost its pressure
+    n_suspect: np.ndarray  # (n_chambers,) ticks in a row in which a chamber seemed to have lost its pressure
     saturated: np.ndarray  # (n_chambers,) bool: a chamber at its limit, off its reference in the mean
     load: Load  # payload
     stop: np.ndarray  # (n_chambers,) states of the chambers' hysteresis
+    n_late: int = 0  # ticks in a row that missed their deadline
     at_rest: bool = False  # nothing has moved for a window; one after the last action, at the earliest
     settled: bool = False  # at rest with each spring on its reference, or its chamber at a limit
     why_lost: str = ""  # message of the sensors
@@ -74,10 +75,12 @@ class Belief:
         spec = controller.policy.spec
         n_springs, n_chambers = spec.n_springs, spec.n_chambers
         window = Window(*(np.empty((0, n)) for n in (n_springs, n_chambers, n_chambers)))
-        springs, chambers = np.zeros(n_springs, bool), np.zeros(n_chambers, bool)
-        masks = springs, springs, chambers, chambers
+        springs = np.zeros(n_springs, int), np.zeros(n_springs, bool)
+        chambers = np.zeros(n_chambers, int), np.zeros(n_chambers, bool)
         unknown_m, load = np.full(n_springs, np.nan), Load.assumed(spec.mass.payload_kg)
-        return cls(controller, Command.none(spec), window, unknown_m, *masks, load, np.zeros(n_chambers))
+        return cls(
+            controller, Command.none(spec), window, unknown_m, *springs, *chambers, load, np.zeros(n_chambers)
+        )
 
     @property
     def pose(self) -> np.ndarray:
@@ -95,6 +98,16 @@ class Belief:
         return pose_of(self.controller, self.spring_m, self.load)
 
     @property
+    def lost(self) -> np.ndarray:
+        """Springs (n_springs,), bool, without a reading in this tick."""
+        return self.n_lost > 0
+
+    @property
+    def suspect(self) -> np.ndarray:
+        """Chambers (n_chambers,), bool, that seem to have lost their pressure."""
+        return self.n_suspect > 0
+
+    @property
     def known(self) -> bool:
         """True once each spring has been read."""
         return not np.isnan(self.spring_m).any()
@@ -110,6 +123,7 @@ def believe(
     last: Belief,
     command: Command,
     readings: np.ndarray | None,
+    late: bool,
     measured_kpa: np.ndarray | None = None,
 ) -> Belief:
     """Return the belief of a tick from the last one and the command in force; arguments as of `loop.step`."""
@@ -123,9 +137,22 @@ def believe(
     seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
     tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
     rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
-    window, spring, chamber = Window(*rows), np.zeros_like(last.stuck), np.zeros_like(last.suspect)
-    masks = lost, spring, chamber, chamber
-    belief = Belief(controller, command, window, spring_m, *masks, last.load, stop, why_lost=why)
+    window = Window(*rows)
+    belief = Belief(
+        controller=controller,
+        command=command,
+        window=window,
+        spring_m=spring_m,
+        n_lost=np.where(lost, last.n_lost + 1, 0),
+        stuck=np.zeros_like(last.stuck),
+        n_suspect=np.zeros_like(last.n_suspect),
+        saturated=np.zeros_like(last.saturated),
+        load=last.load,
+        stop=stop,
+        n_late=last.n_late + 1 if late else 0,
+        why_lost=why,
+        n_unweighed=last.n_unweighed + 1,
+    )
     springs_m, mean_m = window.spring_m, belief.mean_m
 
     # Rest, and trust in sensors and chambers
@@ -141,10 +168,10 @@ def believe(
         suspect = saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
         if suspect.any():
             suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, gains.allocation)
-        belief = replace(belief, settled=on, saturated=mask, suspect=suspect)
+        n_suspect = np.where(suspect, last.n_suspect + 1, 0)
+        belief = replace(belief, settled=on, saturated=mask, n_suspect=n_suspect)
 
     # Payload, of windows that do not overlap
-    belief = replace(belief, n_unweighed=last.n_unweighed + 1)
     doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
     if belief.at_rest and belief.n_unweighed >= size and not doubtful:
         means = mean_m, window.chamber_kpa.mean(axis=0)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm.control import LawState
-from mjx_softarm.deploy.moving.lead import RATE_S, Plan, tip_lag_s
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import RestRule, middle_kpa, rest_rule, spring_lag_s
-from mjx_softarm.policy.reachable import Reachable
+from mjx_softarm.policy.reach import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.spec import ArmSpec
 
@@ -23,13 +22,14 @@ class Controller:
 
     policy: Policy
     reachable: Reachable
-    plan: Plan  # pose and goal (6,), springs (n_springs,) [m], `sensed` of `PolicyRunner.act` -> references
+    # From pose and goal (6,), springs (n_springs,) [m] and `sensed` of `PolicyRunner.act` to references
+    plan: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
     dt_s: float
     rest: RestRule
     observes_payload: bool
 
     @classmethod
-    def of(cls, policy: Policy, plan: Plan | None = None) -> Controller:
+    def of(cls, policy: Policy, plan: Callable[..., np.ndarray] | None = None) -> Controller:
         """Make a policy ready; `plan` replaces its actor, for another way to find references."""
         runner = PolicyRunner(policy)
         lag_s = spring_lag_s(policy, middle_kpa(policy.gains, policy.spec.n_chambers))
@@ -46,25 +46,6 @@ class Controller:
     def window(self) -> int:
         """Number of ticks over which springs are watched."""
         return self.rest.window
-
-    @cached_property
-    def lead_s(self) -> float:
-        """Time by which a moving goal is given ahead; for a policy of motion it takes seconds to find."""
-        policy = self.policy
-        if policy.action_s:
-            return self._whole_ticks(max(0.0, tip_lag_s(policy, self.plan)))
-        return float(np.mean(policy.gains.reference_s)) + 0.5 * RATE_S
-
-    @property
-    def start_s(self) -> float:
-        """Time, of whole ticks, until an arm at rest answers to a goal that begins to move."""
-        if self.policy.action_s:
-            return self.lead_s
-        # The rate of the references is known after `RATE_S`, and the actuators have a dead time
-        return self._whole_ticks(RATE_S + float(np.mean(self.policy.spec.actuators.delay_s)))
-
-    def _whole_ticks(self, time_s: float) -> float:
-        return round(time_s * self.policy.rate_hz) / self.policy.rate_hz
 
 
 class Command(NamedTuple):

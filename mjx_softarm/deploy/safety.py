@@ -42,7 +42,6 @@ import numpy as np
 
 from mjx_softarm.control import allocated_error
 from mjx_softarm.deploy.belief import STUCK_RANGE_M, Belief
-from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import LATE_TICKS, LOST_TICKS
 from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
 from mjx_softarm.sensing.load import KNOWN, holds_payload
@@ -105,29 +104,12 @@ class Event(NamedTuple):
         return f"{self.fault.value}: {self.message} -> {self.response.value}"
 
 
-class Watch(NamedTuple):
-    """Memory of the safety checks."""
-
-    n_late: int  # missed deadlines in a row
-    n_lost: np.ndarray  # (n_springs,) lost readings in a row
-    n_suspect: np.ndarray  # (n_chambers,) ticks in a row in which a chamber seemed to have lost its pressure
-    load_kg: float  # payload of the last tick
-
-
-def check(
-    controller: Controller, watch: Watch, belief: Belief, late: bool
-) -> tuple[Watch, tuple[Event, ...]]:
-    """Return the memory and the faults of a tick; `late` where the last one missed its deadline."""
-    next_watch = Watch(
-        n_late=watch.n_late + 1 if late else 0,
-        n_lost=np.where(belief.lost, watch.n_lost + 1, 0),
-        n_suspect=np.where(belief.suspect, watch.n_suspect + 1, 0),
-        load_kg=belief.load.kg,
-    )
-    events = [*_of_time(controller, next_watch), *_of_sensors(controller, next_watch, belief)]
+def check(last: Belief, belief: Belief) -> tuple[Event, ...]:
+    """Return the faults of a tick, by its belief and that of the last tick."""
+    events = [*_timing_faults(belief), *_sensor_faults(belief)]
     if stop_of(events) is None:
-        events += [*_of_chambers(controller, next_watch, belief), *_of_payload(controller, watch, belief)]
-    return next_watch, tuple(events)
+        events += [*_chamber_faults(belief), *_payload_faults(last, belief)]
+    return tuple(events)
 
 
 def stop_of(events: Iterable[Event]) -> Event | None:
@@ -135,41 +117,41 @@ def stop_of(events: Iterable[Event]) -> Event | None:
     return next((event for event in events if event.response is Response.VENT), None)
 
 
-def _of_time(controller: Controller, watch: Watch) -> Iterator[Event]:
-    late = f"took too long, expected at most {1e3 * controller.dt_s:g} ms"
-    if watch.n_late:
+def _timing_faults(belief: Belief) -> Iterator[Event]:
+    late = f"took too long, expected at most {1e3 * belief.controller.dt_s:g} ms"
+    if belief.n_late:
         yield Event(Fault.MISSED_DEADLINE, f"the last tick {late}")
-    if watch.n_late >= LATE_TICKS:
-        yield Event(Fault.ARM_LATE, f"{watch.n_late} ticks in a row {late}")
+    if belief.n_late >= LATE_TICKS:
+        yield Event(Fault.ARM_LATE, f"{belief.n_late} ticks in a row {late}")
 
 
-def _of_sensors(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
-    gone = watch.n_lost >= LOST_TICKS
+def _sensor_faults(belief: Belief) -> Iterator[Event]:
+    gone = belief.n_lost >= LOST_TICKS
     if belief.lost.any():
         yield Event(Fault.LOST_READING, belief.why_lost)
     if gone.any():
-        text = f"{names('spring', gone)}: no length in {LOST_TICKS} ticks in a row"
-        yield Event(Fault.SENSOR_LOST, text)
+        yield Event(Fault.SENSOR_LOST, f"{names('spring', gone)}: no length in {LOST_TICKS} ticks in a row")
     elif belief.stuck.any():
+        window_s = belief.controller.window * belief.controller.dt_s
         text = f"{names('spring', belief.stuck)}: moved less than {1e3 * STUCK_RANGE_M:g} mm in "
-        text += f"{controller.window * controller.dt_s:g} s, noise included, while the chamber was driven or "
-        yield Event(Fault.SENSOR_STUCK, f"{text}the section moved")
+        text += f"{window_s:g} s, noise included, while the chamber was driven or the section moved"
+        yield Event(Fault.SENSOR_STUCK, text)
 
 
-def _of_chambers(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
+def _chamber_faults(belief: Belief) -> Iterator[Event]:
     n_windows = REST_WINDOWS if belief.at_rest else MOVING_WINDOWS
-    lost = watch.n_suspect >= n_windows * controller.window
+    lost = belief.n_suspect >= n_windows * belief.controller.window
     if lost.any():
         kpa = ", ".join(f"{value:.1f}" for value in belief.command.pressure_kpa[lost])
-        text = f"{names('chamber', lost)}: at {kpa} kPa, but the springs lie as they would without that"
-        yield Event(Fault.CHAMBER_LOST, text)
+        text = f"{names('chamber', lost)}: at {kpa} kPa, but the arm has the shape it would have without that"
+        yield Event(Fault.CHAMBER_LOST, f"{text} pressure")
 
 
-def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
-    """Yield the faults of a payload that was estimated in this tick; `watch` is the last tick's."""
+def _payload_faults(last: Belief, belief: Belief) -> Iterator[Event]:
+    """Yield the faults of a payload that was estimated in this tick."""
     if belief.estimate_kg is None:
         return
-    load, most_kg = belief.load, float(controller.policy.load_estimator.load_scale_kg)
+    load, most_kg = belief.load, float(belief.controller.policy.load_estimator.load_scale_kg)
     believed = f"the pose is estimated with {1e3 * load.believed_kg:.0f} g"
     if not holds_payload(belief.estimate_kg, belief.width_kg, most_kg):
         text = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g, {believed}"
@@ -178,12 +160,12 @@ def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> Iterato
         text = f"payload not known better than {1e3 * belief.width_kg:.0f} g, expected "
         text += f"{1e3 * KNOWN * most_kg:.0f} g: record the poses of `python -m calib plan`; "
         yield Event(Fault.LOAD_UNKNOWN, text + believed)
-    if load.began and load.kg < watch.load_kg:
-        text = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * watch.load_kg:.0f} g before"
+    if load.began and load.kg < last.load.kg:
+        text = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * last.load.kg:.0f} g before"
         yield Event(Fault.LOAD_LOST, text)
     if load.kg - load.half_width_kg > OVERLOAD * most_kg:
-        told = f"{1e3 * load.kg:.0f} +- {1e3 * load.half_width_kg:.0f} g"
-        yield Event(Fault.OVERLOADED, f"{told}, expected at most {1e3 * most_kg:.0f} g")
+        estimate = f"{1e3 * load.kg:.0f} +- {1e3 * load.half_width_kg:.0f} g"
+        yield Event(Fault.OVERLOADED, f"{estimate}, expected at most {1e3 * most_kg:.0f} g")
 
 
 def extrapolated(belief: Belief) -> tuple[Event, ...]:

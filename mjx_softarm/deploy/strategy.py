@@ -3,7 +3,7 @@
     policy     goal    strategy
     at rest    fixed   `AtRest`      acts at once, then each time the springs have settled
     in motion  fixed   `Timed`       acts every `Policy.action_s` seconds
-    either     moving                see `mjx_softarm.deploy.moving.strategy`
+    either     moving                see `mjx_softarm.deploy.moving`
 
 A policy takes an arm as specified to a goal; one that observes the payload takes an arm with the estimated
 payload there. Other deviations leave an error. At rest it shows once the springs have settled, and is
@@ -40,18 +40,14 @@ CORRECTION_SHARE = 0.15
 class Strategy(Protocol):
     """Interface of a strategy: a value with a memory."""
 
-    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+    def references(self, belief: Belief, goal: np.ndarray) -> Answer:
         """Return the references for a goal (6,) [mm, deg], that ahead if it moves, and the next memory."""
         ...
 
 
-class Choice(NamedTuple):
-    """Results of a strategy's tick."""
-
-    strategy: Strategy  # with its next memory
-    reference_m: np.ndarray | None = None  # (n_springs,) None: the last ones stay
-    events: tuple[Event, ...] = ()
-    arrived: bool = False  # no further action is due
+# Strategy with its next memory, None: no further action is due; references (n_springs,) [m], None: the last
+# ones stay; faults
+Answer = tuple[Strategy | None, np.ndarray | None, tuple[Event, ...]]
 
 
 class AtRest(NamedTuple):
@@ -61,7 +57,7 @@ class AtRest(NamedTuple):
     n_actions: int = 0
     acted_load: Load | None = None  # payload at the last action
 
-    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+    def references(self, belief: Belief, goal: np.ndarray) -> Answer:
         """Act or wait; arrive once the springs have settled after the last action.
 
         An action that would lead away from the goal is tried with smaller shifts. Where none will do, the arm
@@ -72,11 +68,11 @@ class AtRest(NamedTuple):
         if not self.n_actions:
             return self._act(belief, goal, [np.zeros(6)])
         if _waits(belief, SETTLE_TIMEOUT_S):
-            return Choice(self)
+            return self, None, ()
 
         events = unsettled(belief)
         if self.n_actions == policy.n_actions:
-            return Choice(self, events=events, arrived=True)
+            return None, None, events
 
         # Shifts that take all, or a share, of the error that the references leave.
         shifts, allowed = [self.shift], None
@@ -93,7 +89,7 @@ class AtRest(NamedTuple):
         shifts: list[np.ndarray],
         events: tuple[Event, ...] = (),
         allowed: float | None = None,
-    ) -> Choice:
+    ) -> Answer:
         """Take the first shift whose references leave a weighted error of at most `allowed`, if given."""
         events += extrapolated(belief)
         for shift in shifts:
@@ -102,9 +98,8 @@ class AtRest(NamedTuple):
                 pose = _made(belief, reference_m, belief.load)
                 if weighted_error(pose, goal, belief.controller.policy.reward) > allowed:
                     continue
-            after = AtRest(shift, self.n_actions + 1, belief.load)
-            return Choice(after, reference_m, events)
-        return Choice(self, events=events, arrived=True)
+            return AtRest(shift, self.n_actions + 1, belief.load), reference_m, events
+        return None, None, events
 
 
 class Timed(NamedTuple):
@@ -115,18 +110,18 @@ class Timed(NamedTuple):
 
     n_actions: int = 0
 
-    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+    def references(self, belief: Belief, goal: np.ndarray) -> Answer:
         """Act or wait; arrive once the springs have settled after the last action."""
         policy = belief.controller.policy
         is_over = self.n_actions == policy.n_actions
         if self.n_actions and _waits(belief, SETTLE_TIMEOUT_S if is_over else policy.action_s):
-            return Choice(self)
+            return self, None, ()
         if is_over:
-            return Choice(self, events=unsettled(belief), arrived=True)
+            return None, None, unsettled(belief)
         after = Timed(self.n_actions + 1)
         is_last = after.n_actions == policy.n_actions
         reference_m = _last(belief, goal) if is_last else planned(belief, belief.pose, goal)
-        return Choice(after, reference_m, extrapolated(belief))
+        return after, reference_m, extrapolated(belief)
 
 
 def to_fixed_goal(policy: Policy) -> AtRest | Timed:
@@ -134,11 +129,11 @@ def to_fixed_goal(policy: Policy) -> AtRest | Timed:
     return Timed() if policy.action_s else AtRest()
 
 
-def _waits(belief: Belief, patience_s: float) -> bool:
-    """Return whether neither rest nor a patience [s] since the last action allow the next one."""
+def _waits(belief: Belief, timeout_s: float) -> bool:
+    """Return True while waiting: not at rest, and no timeout [s] since the last action yet."""
     if belief.settled:
         return bool(belief.suspect.any())  # whether a chamber is lost comes first
-    return belief.command.n_ticks * belief.controller.dt_s < patience_s
+    return belief.command.n_ticks * belief.controller.dt_s < timeout_s
 
 
 def planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:

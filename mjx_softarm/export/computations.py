@@ -15,8 +15,7 @@ from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.rewards import asked_error, weighted_error
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.lag import still
-from mjx_softarm.policy.reach import followed
-from mjx_softarm.policy.reachable import distances
+from mjx_softarm.policy.reach import distances, followed
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.sensors import Reading, SensorFault

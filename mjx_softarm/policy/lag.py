@@ -1,4 +1,4 @@
-"""Lags of a moving arm: springs behind their references, the shape behind the springs; springs at rest.
+"""Lags of an arm's springs behind their references, and the rule by which they are at rest.
 
 NumPy only; `still` takes the symbols of `mjx_softarm.export`, too.
 """
@@ -14,8 +14,7 @@ import numpy as np
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import Gains
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.sensing.estimator import Frame, estimate, even_pose, expected_springs
-from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.spec import ArmSpec
 
 # Change of a pressure from which the springs' response is taken, in ranges of pressure. The slope of a
@@ -68,39 +67,6 @@ def law_lag_s(
     if gains.allocation is not None:
         change = change @ gains.allocation.chamber_error
     return np.linalg.pinv(change * gains.ki_kpa_per_ms, rcond=_LEAST_MODE)
-
-
-class ShapeLag(NamedTuple):
-    """Memory of how unevenly the sections of a moving arm bend.
-
-    The pose at rest with some springs differs from that of sections that bend evenly. In motion this
-    difference lags behind the springs, see `calib.fit.motion.shape`. Both poses are the simulation's: the
-    sim-to-real network's correction does not lag.
-    """
-
-    uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first lengths
-
-    def after(
-        self, policy: Policy, spring_m: np.ndarray, load_kg: float, dt_s: float
-    ) -> tuple[ShapeLag, np.ndarray]:
-        """Return the memory a time dt_s later, and the pose (6,) [mm, deg] at rest minus that in motion.
-
-        Args:
-            policy: the arm.
-            spring_m (n_springs,) [m]: spring lengths then.
-            load_kg: payload.
-            dt_s: time since the last lengths.
-        """
-        # Difference at rest
-        own = policy.estimator
-        base, pose = Frame(own.base_position_m, own.base_rotation), estimate(own, spring_m, load_kg)
-        uneven = pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
-        # The arm begins at rest
-        if self.uneven is None:
-            return ShapeLag(uneven), np.zeros(6)
-        lag_s = policy.spec.shape_lag_s
-        now = self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven)
-        return ShapeLag(now), pose_error(uneven, now)
 
 
 class RestRule(NamedTuple):

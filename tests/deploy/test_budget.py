@@ -9,10 +9,10 @@ import pytest
 
 from calib.changes import MIN_POSES
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.accuracy.budget import Budget, budget
-from mjx_softarm.deploy.accuracy.measure import figures, measure, write_accuracy
 from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.budget import Budget, budget
 from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.measure import figures, measure, write_accuracy
 from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import tip_pose

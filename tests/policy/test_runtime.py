@@ -16,8 +16,7 @@ from mjx_softarm.deploy import PolicyRunner, load_policy
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.workspace import Pool
-from mjx_softarm.policy.actor import policy_from_actor
-from mjx_softarm.policy.file import save_policy
+from mjx_softarm.policy.file import policy_from_actor, save_policy
 from train.agent.networks import Actor, mode
 
 N = 1000

@@ -6,8 +6,7 @@ import datetime
 from pathlib import Path
 
 from mjx_softarm.mdp.actions import N_ACTIONS
-from mjx_softarm.policy.actor import check_actor, policy_from_actor
-from mjx_softarm.policy.file import save_policy
+from mjx_softarm.policy.file import check_actor, policy_from_actor, save_policy
 from train.runs.arm_model import DistilledArm
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run

@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm.deploy.accuracy.measure import at_rest
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import LoopRun
+from mjx_softarm.deploy.measure import at_rest
+from mjx_softarm.deploy.session import LoopRun
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.pose import pose_error
