@@ -220,19 +220,19 @@ def _tell_measured(
         payload_kg: payload at the gripper; None: do not say what makes the error.
     """
     accuracy, ways = measure(run, controller, poses), ways_of(run)
-    found = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
+    numbers = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
         **(along(ways, controller.dt_s) if ways else {}),
     }
     split = None if payload_kg is None else budget(run, controller, payload_kg)
     if split is not None:
-        found["budget"] = split.figures()
-    if missing := write_accuracy(out, accuracy, found, ways):
+        numbers["budget"] = split.figures()
+    if missing := write_accuracy(out, accuracy, numbers, ways):
         print(missing)
     elif split is not None:
         draw(split, out / "budget.png")
-    print_figures(found)
+    print_figures(numbers)
     if split is not None:
         print("\n".join(split.lines()))
     print(f"figures: {out / 'accuracy.json'}")
@@ -259,8 +259,8 @@ def _record(
     # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
-    own = twin_spec(on.arm)
-    arm_spec = ArmSpec.of(spec or own)
+    twin = twin_spec(on.arm)
+    arm_spec = ArmSpec.of(spec or twin)
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
@@ -268,9 +268,9 @@ def _record(
     driver = on.open(arm_spec, tell)
     check_number(driver, arm_spec, f"--arm {on.arm}")
     low, high = arm_spec.chambers.pressure_min_kpa, arm_spec.chambers.pressure_max_kpa
-    default = "" if spec or own else ", by default; --spec names another arm"
+    default = "" if spec or twin else ", by default; --spec names another arm"
     tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
-    if spec and on.arm.startswith("twin:") and ArmSpec.of(own).geometry != arm_spec.geometry:
+    if spec and on.arm.startswith("twin:") and ArmSpec.of(twin).geometry != arm_spec.geometry:
         tell(f"{on.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results

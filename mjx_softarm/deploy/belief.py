@@ -1,8 +1,8 @@
 """Belief about an arm, made of readings and pressures: lengths, payload, pose, rest, doubtful parts.
 
     readings                   -> spring lengths, the last good ones where a reading is lost
-    way of the springs         -> hysteresis of the chambers
-    all this at rest, pressures -> payload
+    motion of the springs      -> hysteresis of the chambers
+    springs, hysteresis and pressures at rest -> payload
     springs, payload           -> pose of the tip (estimator, then sim-to-real network)
 
 Pure functions; NumPy only. Tests of windows take the symbols of `mjx_softarm.export`, too.
@@ -32,7 +32,7 @@ STUCK_PRESSURE_KPA = 2.0  # range of its chamber's pressure at which a live one 
 STUCK_NEIGHBOUR_M = 2e-3  # motion of its section's springs at which a live one moves; by hand
 
 # Lost chambers. By hand, and tested (tests/train/runs/test_estimator.py): no saturated simulated arm is taken
-# for one that leaks; 95 % of lost chambers are found, 85 % with 500 g.
+# for one that leaks; 95 % of lost chambers are detected, 85 % with 500 g.
 LOST_SHARE = 0.5  # least share of the pressure that the arm's shape lacks
 EXPLAINED_SHARE = 0.7  # least share of the springs' squared deviations that this explains
 LOST_EFFECT_M = 0.01  # least change at the chamber; tolerances and payloads look like less
@@ -126,10 +126,8 @@ def believe(
     late: bool,
     measured_kpa: np.ndarray | None = None,
 ) -> Belief:
-    """Return the belief of a tick from the last one and the command in force; arguments as of `loop.step`."""
-    policy, size = controller.policy, controller.window
-    gains, tolerance_m = policy.gains, policy.tolerance_m
-    in_force_kpa, asked_m = command.pressure_kpa, command.reference_m
+    """Return the belief of a tick from the last one and the command in force; see `loop.step`."""
+    policy, size, in_force_kpa = controller.policy, controller.window, command.pressure_kpa
 
     # Lengths with their hysteresis, and the window that ends with them
     spring_m, lost, why = read_lengths(policy.sensor, readings, last.spring_m)
@@ -137,11 +135,10 @@ def believe(
     seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
     tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
     rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
-    window = Window(*rows)
     belief = Belief(
         controller=controller,
         command=command,
-        window=window,
+        window=Window(*rows),
         spring_m=spring_m,
         n_lost=np.where(lost, last.n_lost + 1, 0),
         stuck=np.zeros_like(last.stuck),
@@ -153,49 +150,54 @@ def believe(
         why_lost=why,
         n_unweighed=last.n_unweighed + 1,
     )
-    springs_m, mean_m = window.spring_m, belief.mean_m
+    return _with_load(_with_trust(belief, last), last)
 
-    # Rest, and trust in sensors and chambers
-    if len(springs_m) == size:
-        at_rest = command.n_ticks >= size and bool(still(springs_m, controller.rest.still_m))
-        n_sections = policy.spec.structure.n_sections
-        stuck = stuck_springs(springs_m, window.pressure_kpa, n_sections)
+
+def _with_trust(belief: Belief, last: Belief) -> Belief:
+    """Return the belief with rest, and with sensors and chambers that are in doubt."""
+    controller, policy, command = belief.controller, belief.controller.policy, belief.command
+    gains, pressure_kpa, asked_m = policy.gains, command.pressure_kpa, command.reference_m
+    springs_m = belief.window.spring_m
+    if len(springs_m) == controller.window:
+        at_rest = command.n_ticks >= controller.window and bool(still(springs_m, controller.rest.still_m))
+        stuck = stuck_springs(springs_m, belief.window.pressure_kpa, policy.spec.structure.n_sections)
         belief = replace(belief, at_rest=at_rest, stuck=stuck)
-    if asked_m is not None and belief.known:
-        arrived_m = controller.rest.arrived_m
-        on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, arrived_m))
-        mask = saturated(in_force_kpa, asked_m, mean_m, gains, tolerance_m)
-        suspect = saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
-        if suspect.any():
-            suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, gains.allocation)
-        n_suspect = np.where(suspect, last.n_suspect + 1, 0)
-        belief = replace(belief, settled=on, saturated=mask, n_suspect=n_suspect)
+    if asked_m is None or not belief.known:
+        return belief
 
-    # Payload, of windows that do not overlap
-    doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
-    if belief.at_rest and belief.n_unweighed >= size and not doubtful:
-        means = mean_m, window.chamber_kpa.mean(axis=0)
-        load, estimate_kg, width_kg = _weighed(controller, last.load, *means, stop)
-        belief = replace(belief, load=load, estimate_kg=estimate_kg, width_kg=width_kg, n_unweighed=0)
-    return belief
+    arrived_m, tolerance_m = controller.rest.arrived_m, policy.tolerance_m
+    settled = belief.at_rest and bool(on_reference(springs_m, asked_m, pressure_kpa, gains, arrived_m))
+    suspect = saturated(pressure_kpa, asked_m, belief.spring_m, gains, tolerance_m)
+    if suspect.any():
+        suspect &= explained_by_pressure_loss(
+            policy.spring_model, pressure_kpa, belief.spring_m, gains.allocation
+        )
+    return replace(
+        belief,
+        settled=settled,
+        saturated=saturated(pressure_kpa, asked_m, belief.mean_m, gains, tolerance_m),
+        n_suspect=np.where(suspect, last.n_suspect + 1, 0),
+    )
 
 
-def _weighed(
-    controller: Controller, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray, stop: np.ndarray
-) -> tuple[Load, float, float]:
-    """Return the averaged payload, this window's estimate [kg] and the half-width [kg] of its interval.
+def _with_load(belief: Belief, last: Belief) -> Belief:
+    """Return the belief with the payload that an arm at rest shows, over windows that do not overlap.
 
-    The estimate takes mean springs and pressures at rest, and the hysteresis there. An estimate whose
-    interval holds no payload leaves the specified payload, and so does a first one that is not known well.
+    An estimate whose interval holds no payload leaves the specified payload. One that is not known well
+    changes nothing.
     """
-    model = controller.policy.load_estimator
+    doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
+    if not belief.at_rest or belief.n_unweighed < belief.controller.window or doubtful:
+        return belief
+    model, load = belief.controller.policy.load_estimator, last.load
     most_kg = float(model.load_scale_kg)
-    estimate_kg, width_kg = map(float, estimate_load(model, mean_m, mean_kpa, stop))
+    mean_kpa = belief.window.chamber_kpa.mean(axis=0)
+    estimate_kg, width_kg = map(float, estimate_load(model, belief.mean_m, mean_kpa, belief.stop))
     if not holds_payload(estimate_kg, width_kg, most_kg):
-        return Load.assumed(load.assumed_kg), estimate_kg, width_kg
-    if width_kg > KNOWN * most_kg:
-        return load, estimate_kg, width_kg
-    return averaged(load, estimate_kg, width_kg, most_kg), estimate_kg, width_kg
+        load = Load.assumed(load.assumed_kg)
+    elif width_kg <= KNOWN * most_kg:
+        load = averaged(load, estimate_kg, width_kg, most_kg)
+    return replace(belief, load=load, estimate_kg=estimate_kg, width_kg=width_kg, n_unweighed=0)
 
 
 def hysteresis_after(policy: Policy, stop: Array, last_m: Array, spring_m: Array) -> Array:
@@ -274,18 +276,18 @@ def _range(values: Array) -> Array:
     return xp.max(values, axis=0) - xp.min(values, axis=0)
 
 
-def as_without(
+def explained_by_pressure_loss(
     model: SpringModel,
     pressure_kpa: Array,
     spring_m: Array,
     allocation: Allocation | None = None,
 ) -> Array:
-    """Return for which chambers (n_chambers,) the springs lie as they would without that chamber's pressure.
+    """Return for which chambers (n_chambers,) a loss of pressure explains the arm's shape.
 
     The springs' deviations from the model's lengths are then, for the most part, a good share of the
     deviations that the pressure's absence makes. A chamber at its limit with its spring off the reference
-    either is saturated or, if the springs lie so, no longer holds pressure. Redundant chambers make up for a
-    lost one: it is found once one of them is at its limit.
+    either is saturated or, if this holds, has lost its pressure. Redundant chambers make up for a lost one:
+    the loss shows once one of them is at its limit.
 
     Args:
         model: network of the unloaded arm.
@@ -293,9 +295,9 @@ def as_without(
         spring_m (n_springs,) [m]: lengths.
         allocation: matrices of an arm with redundant chambers.
     """
-    xp, own = array_namespace(pressure_kpa, spring_m), np.eye(len(pressure_kpa), dtype=bool)
-    without_kpa = xp.where(own, 0.0, pressure_kpa)  # (n_chambers, n_chambers)
-    pressures_kpa = xp.concat([pressure_kpa[None], without_kpa])
+    xp, diagonal = array_namespace(pressure_kpa, spring_m), np.eye(len(pressure_kpa), dtype=bool)
+    one_less_kpa = xp.where(diagonal, 0.0, pressure_kpa)  # (n_chambers, n_chambers)
+    pressures_kpa = xp.concat([pressure_kpa[None], one_less_kpa])
     springs_m = expected_springs(model, pressures_kpa)
     effect_m = springs_m[1:] - springs_m[0]  # (n_chambers, n_springs)
     deviation_m = spring_m - springs_m[0]  # (n_springs,)
@@ -303,6 +305,6 @@ def as_without(
     share = effect_m @ deviation_m / size  # (n_chambers,)
     left_m = deviation_m - share[:, None] * effect_m
     explained = 1.0 - xp.sum(left_m**2, axis=1) / xp.sum(deviation_m**2)
-    own_m = xp.abs(share * xp.sum(xp.where(own, at_chambers(effect_m, allocation), 0.0), axis=1))
+    chamber_m = xp.abs(share * xp.sum(xp.where(diagonal, at_chambers(effect_m, allocation), 0.0), axis=1))
     enough = (share > LOST_SHARE) & (explained > EXPLAINED_SHARE)
-    return enough & (own_m > LOST_EFFECT_M)
+    return enough & (chamber_m > LOST_EFFECT_M)

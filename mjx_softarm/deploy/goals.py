@@ -65,13 +65,13 @@ class ListedGoals:
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
         """Go on to the next accepted goal where there is none; end after the last one, or the duration."""
         self._began_s = now_s if np.isnan(self._began_s) else self._began_s
-        state, events = self.taken(state)
+        state, events = self.take_next(state)
         over = self._duration_s is not None and now_s - self._began_s >= self._duration_s
         ended = state.goal is None and self.n_taken == len(self._goals)
         over |= ended and not (self._stays and self._accepted)
         return None if over else state, events
 
-    def taken(self, state: LoopState) -> tuple[LoopState, Events]:
+    def take_next(self, state: LoopState) -> tuple[LoopState, Events]:
         """Return the state with the next accepted goal, if it has none, and the refusals until then."""
         refusals = []
         while state.goal is None and self.n_taken < len(self._goals):
@@ -96,11 +96,13 @@ class OrderedGoals(ListedGoals):
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
         """Obey the order since the last tick."""
         order = self._orders()
-        if order is not None:
-            self._goals, self.n_taken = [] if isinstance(order, str) else list(order), 0
-            change = {"vent": release, "hold": hold}.get(order) if isinstance(order, str) else None
-            state = change(state) if change else state._replace(goal=None)
-        return self.taken(state)
+        if isinstance(order, str):
+            self._goals, self.n_taken = [], 0
+            state = {"vent": release, "hold": hold}[order](state)
+        elif order is not None:
+            self._goals, self.n_taken = list(order), 0
+            state = state._replace(goal=None)
+        return self.take_next(state)
 
 
 class MovingGoal:
@@ -152,7 +154,7 @@ class MovingGoal:
         strategy = state.strategy
         if state.ahead is None:  # it has just left the stop
             strategy = to_moving_goal(self._controller.policy, self._lead_s)
-        goal, ahead = self._at(now_s), self._at(now_s + self._lead_s)
+        goal, ahead = self._place(now_s), self._place(now_s + self._lead_s)
         return state._replace(goal=goal, ahead=ahead, strategy=strategy), ()
 
     def _stop(self, state: LoopState) -> tuple[LoopState | None, Events]:
@@ -160,13 +162,13 @@ class MovingGoal:
         state, events = with_goal(self._controller, state, self._poses[self.n_taken - 1])
         return None if events else state, events
 
-    def _at(self, now_s: float) -> np.ndarray:
+    def _place(self, now_s: float) -> np.ndarray:
         """Return the place (6,) [mm, deg] of the goal at a time."""
         return on_the_way(self._leg, (now_s - self._began_s) / (self._pace_s * (len(self._leg) - 1)))
 
 
 def on_the_way(goals: np.ndarray, share: float) -> np.ndarray:
     """Return the pose (6,) [mm, deg] after a share of the way past goals (p, 6); its ends beyond 0 and 1."""
-    at = min(max(share, 0.0), 1.0) * (len(goals) - 1)
-    k = min(int(at), len(goals) - 2)
-    return goals[k] + (at - k) * pose_error(goals[k + 1], goals[k])
+    passed = min(max(share, 0.0), 1.0) * (len(goals) - 1)
+    k = min(int(passed), len(goals) - 2)
+    return goals[k] + (passed - k) * pose_error(goals[k + 1], goals[k])

@@ -85,10 +85,10 @@ def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
     chosen = np.zeros(1, int)
     for n_cells in range(1, n + 1):  # along the longest side
         size = (high - low).max() / n_cells + 1e-6
-        at = (workspace[:, :3] - low) / size
-        away = np.linalg.norm(at - np.floor(at) - 0.5, axis=1)
+        cell = (workspace[:, :3] - low) / size
+        away = np.linalg.norm(cell - np.floor(cell) - 0.5, axis=1)
         order = np.argsort(away)
-        _, first = np.unique(np.floor(at[order]), axis=0, return_index=True)
+        _, first = np.unique(np.floor(cell[order]), axis=0, return_index=True)
         if len(first) > n:
             break
         chosen = order[first]
@@ -247,7 +247,7 @@ def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
 
 
 def write_accuracy(
-    folder: Path, accuracy: Accuracy, found: Mapping[str, Any], ways: Sequence[Way] = ()
+    folder: Path, accuracy: Accuracy, numbers: Mapping[str, Any], ways: Sequence[Way] = ()
 ) -> str:
     """Write `accuracy.json` and, with matplotlib, `accuracy.png`; return why there is no picture, or "".
 
@@ -261,8 +261,8 @@ def write_accuracy(
         {"goal": goal.tolist(), "error": error.tolist() if np.isfinite(error).all() else None}
         for goal, error in zip(accuracy.goal, accuracy.error, strict=True)
     ]
-    numbers = {name: None if value != value else value for name, value in found.items()}
-    text = json.dumps({**numbers, "at": points}, indent=2, allow_nan=False)
+    finite = {name: None if value != value else value for name, value in numbers.items()}
+    text = json.dumps({**finite, "at": points}, indent=2, allow_nan=False)
     (folder / "accuracy.json").write_text(f"{text}\n", "utf-8")
 
     # Goals and tips from above and from the side; shares of the goals, or of the time, below an error

@@ -51,7 +51,7 @@ class ShapeLag(NamedTuple):
 
     uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first lengths
 
-    def after(
+    def advance(
         self, policy: Policy, spring_m: np.ndarray, load_kg: float, dt_s: float
     ) -> tuple[ShapeLag, np.ndarray]:
         """Return the memory a time dt_s later, and the pose (6,) [mm, deg] at rest minus that in motion.
@@ -63,9 +63,9 @@ class ShapeLag(NamedTuple):
             dt_s: time since the last lengths.
         """
         # Difference at rest
-        own = policy.estimator
-        base, pose = Frame(own.base_position_m, own.base_rotation), estimate(own, spring_m, load_kg)
-        uneven = pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
+        model = policy.estimator
+        base, pose = Frame(model.base_position_m, model.base_rotation), estimate(model, spring_m, load_kg)
+        uneven = pose_error(np.asarray(pose, float), even_pose(base, model.spring_site_m, spring_m))
         # The arm begins at rest
         if self.uneven is None:
             return ShapeLag(uneven), np.zeros(6)
@@ -85,7 +85,7 @@ class WayError(NamedTuple):
     goals: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] of each tick, from the one two ticks ago to the lead
     correction_mm: np.ndarray = np.zeros(3)  # correction of the goal now
 
-    def after(self, goal: np.ndarray, pose: np.ndarray, controller: Controller) -> WayError:
+    def advance(self, goal: np.ndarray, pose: np.ndarray, controller: Controller) -> WayError:
         """Return the memory a tick later, for a goal ahead (6,) and a believed pose now (6,) [mm, deg]."""
         # Wait until the goals reach back to the present one.
         dt_s = controller.dt_s
@@ -140,14 +140,14 @@ class Predicting(NamedTuple):
         # Lengths at the goal, of an arm whose shape lags and that has been beside its way
         controller, policy, pose = belief.controller, belief.controller.policy, belief.pose
         shift, length_m = self.shift, belief.spring_m
-        way = self.way.after(goal, pose - self.behind, controller)
+        way = self.way.advance(goal, pose - self.behind, controller)
         goal = goal + self.behind + way.correction
         for _ in range(policy.n_actions):
             length_m = planned(belief, pose, goal + shift)
             pose, _ = pose_of(controller, length_m, belief.load)
             left = asked_error(np.asarray(pose, float), goal, policy.reward)
             shift = clipped(shift - left)
-        shape, behind = self.shape.after(policy, length_m, belief.load.believed_kg, controller.dt_s)
+        shape, behind = self.shape.advance(policy, length_m, belief.load.believed_kg, controller.dt_s)
 
         # Lengths due now, their rate, and the lag of springs that move so
         n_ticks = 2 * max(1, round(0.5 * RATE_S / controller.dt_s))
@@ -173,9 +173,9 @@ class Chasing(NamedTuple):
         """Act from the pose in motion towards the goal, corrected by its error on the way."""
         controller, policy = belief.controller, belief.controller.policy
         load_kg = belief.load.believed_kg
-        shape, behind = self.shape.after(policy, belief.spring_m, load_kg, controller.dt_s)
+        shape, behind = self.shape.advance(policy, belief.spring_m, load_kg, controller.dt_s)
         pose = belief.pose - behind
-        way = self.way.after(goal, pose, controller)
+        way = self.way.advance(goal, pose, controller)
 
         # The last action that it observes, from those in force at the stop on
         last_m = self.references_m or (belief.command.reference_m,)
@@ -252,7 +252,7 @@ def _tip_path(controller: Controller, pressure_kpa: np.ndarray, goals: np.ndarra
     # References and pressures of each tick
     lengths_m, references_m, tip_mm, shape = [spring_m], [spring_m], [], ShapeLag()
     for goal in goals:
-        shape, behind = shape.after(policy, spring_m, 0.0, dt_s)
+        shape, behind = shape.advance(policy, spring_m, 0.0, dt_s)
         at_rest = _pose(policy, spring_m)
         pose = at_rest - behind
         tip_mm.append(pose[:3])

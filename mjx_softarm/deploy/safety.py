@@ -22,7 +22,7 @@
     OVERLOADED         a payload whose whole interval is above OVERLOAD times the       go on
                        largest
     LOAD_UNKNOWN       springs and pressures that no payload explains, or a calibration go on
-                       that tells none better than KNOWN:       the pose is estimated
+                       that knows none better than KNOWN:       the pose is estimated
                        from the springs alone, with the payload believed before
 
 Names in capitals are constants, here and where they are imported from. To vent is to end the run and
@@ -91,7 +91,7 @@ PAYLOAD_FAULTS = {Fault.OVERLOADED, Fault.LOAD_UNKNOWN}  # they last from one es
 
 
 class Event(NamedTuple):
-    """A fault that was found."""
+    """A fault that has occurred."""
 
     fault: Fault
     message: str
@@ -158,7 +158,7 @@ def _payload_faults(last: Belief, belief: Belief) -> Iterator[Event]:
         yield Event(Fault.LOAD_UNKNOWN, text)
     elif belief.width_kg > KNOWN * most_kg:
         text = f"payload not known better than {1e3 * belief.width_kg:.0f} g, expected "
-        text += f"{1e3 * KNOWN * most_kg:.0f} g: record the poses of `python -m calib plan`; "
+        text += f"{1e3 * KNOWN * most_kg:.0f} g: record more random poses, and calibrate; "
         yield Event(Fault.LOAD_UNKNOWN, text + believed)
     if load.began and load.kg < last.load.kg:
         text = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * last.load.kg:.0f} g before"

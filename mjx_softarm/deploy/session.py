@@ -233,7 +233,7 @@ class _Session:
                 self._arrive(row["goal"], row["estimate"])
             self.look(self.state, row)
         if stop is not None:
-            raise _Stopped(self._at(f"{stop.fault.value}: {stop.message}"))
+            raise _Stopped(self._stamped(f"{stop.fault.value}: {stop.message}"))
         return in_time
 
     def _log(self, row: dict[str, Any]) -> None:
@@ -243,13 +243,13 @@ class _Session:
         self.rows.add(row)
 
     def _note(self, events: Sequence[Event], estimated: bool = False) -> None:
-        """Count events, and tell those that are new in this tick; the end of the run tells why it vents.
+        """Count events, and report those that are new in this tick; the end of the run says why it vents.
 
         Faults of the payload last until it is next estimated; `estimated` says whether it was.
         """
         for event in events:
             if event.fault not in self.last and event.response is not Response.VENT:
-                self.tell(self._at(event))
+                self.tell(self._stamped(event))
         lasting = set() if estimated else self.last & PAYLOAD_FAULTS
         self.last = lasting | {event.fault for event in events}
         self.events.extend(events)
@@ -267,7 +267,7 @@ class _Session:
         if any(reward.asked[3:]):
             off += f"; yaw, pitch, roll {', '.join(f'{value:+.1f}' for value in asked[3:])} deg off"
         missed = "" if reached else f"; NOT REACHED, {share:.2f} times the error that a goal allows"
-        self.tell(self._at(f"goal {len(self.arrivals)}: {off}{missed}"))
+        self.tell(self._stamped(f"goal {len(self.arrivals)}: {off}{missed}"))
         self.arrived(self.goals.n_taken - 1)
 
     def _seen_error(self, goal: np.ndarray) -> np.ndarray:
@@ -278,7 +278,7 @@ class _Session:
         tip_m, quaternion = (np.array([row[name] for row in rows]) for name in ("tip_m", "tip_quaternion"))
         return seen_error(tip_m, quaternion, goal)
 
-    def _at(self, text: object) -> str:
+    def _stamped(self, text: object) -> str:
         return f"{len(self.rows) * self.controller.dt_s:.2f} s: {text}"
 
 

@@ -77,7 +77,7 @@ class AtRest(NamedTuple):
         # Shifts that take all, or a share, of the error that the references leave.
         shifts, allowed = [self.shift], None
         if belief.settled:
-            pose, left = _left(self, belief, goal)
+            pose, left = _remaining_error(self, belief, goal)
             shifts = [clipped(self.shift - share * left) for share in SHARES]
             allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
         return self._act(belief, goal, shifts, events, allowed)
@@ -95,7 +95,7 @@ class AtRest(NamedTuple):
         for shift in shifts:
             reference_m = planned(belief, belief.pose, goal + shift)
             if allowed is not None:
-                pose = _made(belief, reference_m, belief.load)
+                pose = _pose_made(belief, reference_m, belief.load)
                 if weighted_error(pose, goal, belief.controller.policy.reward) > allowed:
                     continue
             return AtRest(shift, self.n_actions + 1, belief.load), reference_m, events
@@ -105,7 +105,7 @@ class AtRest(NamedTuple):
 class Timed(NamedTuple):
     """Actions of a policy of motion: at regular times, whether the springs have settled or not.
 
-    Its references lead the arm. The last ones stay, so they are to make the goal at rest; see `_last`.
+    Its references lead the arm. The last ones stay, so they are to make the goal at rest: `_final_references`.
     """
 
     n_actions: int = 0
@@ -118,10 +118,10 @@ class Timed(NamedTuple):
             return self, None, ()
         if is_over:
             return None, None, unsettled(belief)
-        after = Timed(self.n_actions + 1)
-        is_last = after.n_actions == policy.n_actions
-        reference_m = _last(belief, goal) if is_last else planned(belief, belief.pose, goal)
-        return after, reference_m, extrapolated(belief)
+        n_actions = self.n_actions + 1
+        is_last = n_actions == policy.n_actions
+        reference_m = _final_references(belief, goal) if is_last else planned(belief, belief.pose, goal)
+        return Timed(n_actions), reference_m, extrapolated(belief)
 
 
 def to_fixed_goal(policy: Policy) -> AtRest | Timed:
@@ -155,7 +155,7 @@ def observed(belief: Belief, last_m: np.ndarray | None = None) -> np.ndarray | N
     return sensed(controller.policy, belief.pose, belief.spring_m, motion, belief.load.believed_kg)
 
 
-def _last(belief: Belief, goal: np.ndarray) -> np.ndarray:
+def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
     """Return the last references (n_springs,) [m] of a policy of motion for a goal (6,) [mm, deg].
 
     The goal is shifted by a share of the error that the references would leave at rest, several times. Those
@@ -174,21 +174,21 @@ def _last(belief: Belief, goal: np.ndarray) -> np.ndarray:
     return best_m
 
 
-def _left(strategy: AtRest, belief: Belief, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _remaining_error(strategy: AtRest, belief: Belief, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose (6,) that the references make, and the error (6,) [mm, deg] that a shift is to correct.
 
     The payload's deflection is compensated once: by the policy's next action if it observes the payload, else
-    by the shift. So the error of a policy that observes it is told with the payload of its last action.
+    by the shift. So the error of a policy that observes it is estimated with the payload of its last action.
     """
     reference_m = belief.command.reference_m
     assert reference_m is not None and strategy.acted_load is not None
-    pose = acted = _made(belief, reference_m, belief.load)
+    pose = acted = _pose_made(belief, reference_m, belief.load)
     if belief.controller.observes_payload:
-        acted = _made(belief, reference_m, strategy.acted_load)
+        acted = _pose_made(belief, reference_m, strategy.acted_load)
     return pose, asked_error(acted, goal, belief.controller.policy.reward)
 
 
-def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
+def _pose_made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     """Return the pose (6,) [mm, deg] of an arm at rest on its last references, moved to others."""
     asked_m, policy = belief.command.reference_m, belief.controller.policy
     assert asked_m is not None

@@ -8,7 +8,12 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import LawState, pressures, saturated
-from mjx_softarm.deploy.belief import as_without, hysteresis_after, on_reference, stuck_springs
+from mjx_softarm.deploy.belief import (
+    explained_by_pressure_loss,
+    hysteresis_after,
+    on_reference,
+    stuck_springs,
+)
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
@@ -178,7 +183,7 @@ def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation
     settled = on_reference(at.springs_m, at.reference_m, at.pressure_kpa, gains, rest.arrived_m)
     mask = saturated(at.pressure_kpa, at.reference_m, at.spring_m, gains, policy.tolerance_m)
     stuck = stuck_springs(at.springs_m, at.pressures_kpa, policy.spec.structure.n_sections)
-    without = as_without(policy.spring_model, at.pressure_kpa, at.spring_m, gains.allocation)
+    lost = explained_by_pressure_loss(policy.spring_model, at.pressure_kpa, at.spring_m, gains.allocation)
     # Error of a pose, and lengths that references make.
     pose = xp.asarray(at.pose, dtype=np.float64)
     weighted = weighted_error(pose, at.goal, policy.reward)
@@ -189,7 +194,7 @@ def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation
         "on_reference": _of(at.springs_m, at.reference_m, at.pressure_kpa, holds=settled),
         "saturated": _of(at.pressure_kpa, at.reference_m, at.spring_m, mask=mask),
         "stuck": _of(at.springs_m, at.pressures_kpa, mask=stuck),
-        "as_without": _of(at.pressure_kpa, at.spring_m, mask=without),
+        "as_without": _of(at.pressure_kpa, at.spring_m, mask=lost),
         "left": _of(at.pose, at.goal, off=asked_error(pose, at.goal, policy.reward), error=weighted),
         "followed": _of(*moved, lengths_m=followed(*moved, policy)),
     }

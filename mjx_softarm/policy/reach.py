@@ -3,7 +3,7 @@
 Stored poses lie some 15 mm apart. The search is sharper, and takes longer than a tick. It runs over the
 pressures between their limits: pressures give spring lengths, spring lengths give the tip pose. It takes
 Levenberg-Marquardt steps from several starts at once, and holds a pressure at its limit if a step would leave
-the range. Poses that the arm reaches in simulation are found to about 0.4 mm.
+the range. Poses that the arm reaches in simulation are reached to about 0.4 mm.
 `begin`, `improve` and `nearest_of` take NumPy arrays and the symbols of `mjx_softarm.export`.
 
 Source: Kanzow, Yamashita, Fukushima, "Levenberg-Marquardt methods with strong local convergence properties
@@ -47,14 +47,14 @@ class Reachable(NamedTuple):
         """Compare poses (m, 6) [mm, deg] spread over the workspace, two thousand or more."""
         pose = np.asarray(pose, np.float64)
         position, flat = _weighted(reward, pose)
-        found = cls(pose, position, flat, reward, 0.0)
+        poses = cls(pose, position, flat, reward, 0.0)
         nearest = []
         for start in range(0, len(pose), _CHUNK):
             rows = np.arange(start, min(start + _CHUNK, len(pose)))
-            distance = _distances(found, found.position[rows], flat[rows])  # (rows, m)
+            distance = _distances(poses, poses.position[rows], flat[rows])  # (rows, m)
             distance[np.arange(len(rows)), rows] = np.inf
             nearest.append(distance.min(axis=1))
-        return found._replace(limit=float(np.concatenate(nearest).max()))
+        return poses._replace(limit=float(np.concatenate(nearest).max()))
 
 
 def nearest(reachable: Reachable, goal: np.ndarray) -> tuple[np.ndarray, float]:
@@ -122,8 +122,8 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     xp, n = array_namespace(goal, search), policy.spec.n_chambers
     share, damping = search[:, :n], search[:, n]
     target = _target(policy, goal, len(share))  # (rows, f)
-    error = _at(policy, share) - target
-    beside = _at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, f)
+    error = _features_at(policy, share) - target
+    beside = _features_at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, f)
     slope = (beside - error[:, None]) / _DIFFERENCE
     gradient = xp.sum(slope * error[:, None], axis=-1)  # (rows, n)
     # Pressures at a limit that would leave their range do not move.
@@ -132,7 +132,7 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     # Take the step where it helps; else only raise the damping.
     curvature = slope @ xp.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
     tried = xp.clip(share - solve(curvature, gradient), 0.0, 1.0)
-    helped = xp.sum((_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
+    helped = xp.sum((_features_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
     damping = xp.clip(damping * xp.where(helped, _EASE, _STIFFEN), _LEAST_DAMPING, _MOST_DAMPING)
     return xp.concat([xp.where(helped[:, None], tried, share), damping[:, None]], axis=1)
 
@@ -140,7 +140,7 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
 def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array]:
     """Return a search's nearest poses (k, 6) [mm, deg] to goals (k, 6), and their weighted errors (k,)."""
     xp, share = array_namespace(goal, search), search[:, : policy.spec.n_chambers]
-    error = _at(policy, share) - _target(policy, goal, len(share))
+    error = _features_at(policy, share) - _target(policy, goal, len(share))
     square = xp.sum(error**2, axis=-1).reshape(-1, N_STARTS)
     pose = pose_from_frame(*_tip(policy, share)).reshape(-1, N_STARTS, 6)
     best, least = pose[:, 0], square[:, 0]
@@ -166,7 +166,7 @@ def _springs(policy: Policy, share: Array) -> Array:
     return expected_springs(policy.spring_model, low + (high - low) * share)
 
 
-def _at(policy: Policy, share: Array) -> Array:
+def _features_at(policy: Policy, share: Array) -> Array:
     """Return the `_features` (..., f) of the tip at shares (..., n) of the range of pressures."""
     return _features(policy, *_tip(policy, share))
 

@@ -33,7 +33,7 @@ def test_an_error_that_stays_beside_a_round_way_is_made_up_for(n_lead):
         late = corrected[-n_ago] if len(corrected) >= n_ago else np.zeros(6)  # the correction is in force
         outward, along, up = axes(k)
         off_mm = 3.0 * outward - 4.0 * along + 2.0 * up
-        way = way.after(ahead, now + np.append(off_mm, np.zeros(3)) + late, controller)
+        way = way.advance(ahead, now + np.append(off_mm, np.zeros(3)) + late, controller)
         corrected.append(way.correction)
     assert np.linalg.norm(off_mm + late[:3]) < 0.02 * np.linalg.norm(off_mm)
     assert not corrected[n_lead].any() and not way.correction[3:].any()
@@ -53,15 +53,15 @@ def test_the_shape_lags_by_the_time_constant_of_the_backbone_and_is_at_rest_with
         policy = dataclasses.replace(policy, s2r=s2r_of(layers, 0.1))
     lag_s, rate_m_per_s = SPEC.shape_lag_s, 5e-3 * (np.arange(N) == N - 1)
     start_m = np.full(N, SPEC.geometry.section_length_m)  # the straight arm, whose plates are level
-    shape, behind = ShapeLag().after(policy, start_m, load_kg, DT_S)
+    shape, behind = ShapeLag().advance(policy, start_m, load_kg, DT_S)
     assert not behind.any()
     for k in range(1, round(8.0 * lag_s / DT_S)):
         spring_m = start_m + k * DT_S * rate_m_per_s
-        shape, behind = shape.after(policy, spring_m, load_kg, DT_S)
+        shape, behind = shape.advance(policy, spring_m, load_kg, DT_S)
     expected_mm = 2.5 * (1.0 + load_kg) * lag_s  # 5 mm/s of the spring
     np.testing.assert_allclose(behind, [expected_mm, 0.0, 0.0, 0.0, 0.0, 0.0], rtol=1e-3, atol=2e-3)
     for _ in range(round(12.0 * lag_s / DT_S)):
-        shape, behind = shape.after(policy, spring_m, load_kg, DT_S)
+        shape, behind = shape.advance(policy, spring_m, load_kg, DT_S)
     np.testing.assert_allclose(behind, 0.0, atol=1e-3)
 
 

@@ -65,8 +65,8 @@ def open_arm(name: str) -> Any:
             raise InputError(f"--arm: {error}") from error
 
     # A driver's class
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.insert(0, here)
+    if (folder := os.getcwd()) not in sys.path:
+        sys.path.insert(0, folder)
     try:
         kind = getattr(importlib.import_module(module_name), item)
     except ImportError as error:
