@@ -175,12 +175,4 @@ IMITATION_PRESETS: dict[str, TrainConfig] = {
         learner=dataclasses.replace(_PRINTED, total_env_steps=1_000_000, rebalance_env_steps=100_000),
         evaluation_epochs=14,
     ),
-    # Half-second actions in motion. Payloads as they are carried: they change how the arm moves.
-    "pipe-moving": TrainConfig(
-        learner=_PIPE,
-        evaluation_epochs=2,
-        env=dataclasses.replace(
-            _MOVING, randomisation=dataclasses.replace(_MOVING.randomisation, payload_max_kg=0.25)
-        ),
-    ),
 }

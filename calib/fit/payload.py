@@ -38,7 +38,6 @@ from calib.read.static_poses import StaticPoses
 from mjx_softarm._support import xla
 from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import arms_at_once, settle
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
@@ -111,7 +110,7 @@ def _rises(n_at_once: int | None) -> Callable[..., Array]:
     """Return a program for the derivative (..., n_springs) of the payload's rise by S2R, by the springs."""
 
     def rise_m(reference_m: Array, params: ArmParams, s2r: S2R) -> Array:
-        end = settle(chain_kinematics(params), params, reference_m, n_at_once)
+        end = settle(params, reference_m, n_at_once)
         frame = end.tip_position_m, end.tip_rotation
         simulated_m, real_m = (_height_m(at, params) for at in (frame, corrected(s2r, frame, end.spring_m)))
         return real_m - simulated_m

@@ -158,7 +158,7 @@ def _payload_faults(last: Belief, belief: Belief) -> Iterator[Event]:
         yield Event(Fault.LOAD_UNKNOWN, text)
     elif belief.width_kg > KNOWN * most_kg:
         text = f"payload not known better than {1e3 * belief.width_kg:.0f} g, expected "
-        text += f"{1e3 * KNOWN * most_kg:.0f} g: record more random poses, and calibrate; "
+        text += f"{1e3 * KNOWN * most_kg:.0f} g: record more random poses; "
         yield Event(Fault.LOAD_UNKNOWN, text + believed)
     if load.began and load.kg < last.load.kg:
         text = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * last.load.kg:.0f} g before"

@@ -105,7 +105,7 @@ class AtRest(NamedTuple):
 class Timed(NamedTuple):
     """Actions of a policy of motion: at regular times, whether the springs have settled or not.
 
-    Its references lead the arm. The last ones stay, so they are to make the goal at rest: `_final_references`.
+    Its references lead the arm. The last ones stay, so `_final_references` makes the goal at rest.
     """
 
     n_actions: int = 0

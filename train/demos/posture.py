@@ -55,9 +55,8 @@ class PostureTarget(NamedTuple):
 def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
     """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        kinematics = chain_kinematics(params)
-        found = settle_pressures(kinematics, params.without_pressure_limits(), pressure_kpa)
-        frames = kinematics(found.q)
+        found = settle_pressures(params.without_pressure_limits(), pressure_kpa)
+        frames = chain_kinematics(params)(found.q)
         plates = frames.plate_position, frames.plate_rotation
         pose = pose_from_frame(frames.tip_position, frames.tip_rotation)
         if s2r is not None:

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from calib.fit.held_pressures import fit_held_pressures, hysteresis_kpa
-from calib.fit.payload import PayloadPoses, payload_half_widths
-from calib.payload_plan import choose_for_payload
 from mjx_softarm._support.archive import SealedFileError, entries_of, write_sealed
 from mjx_softarm.control import allocation, chambers_of_springs
 from mjx_softarm.sensing.held_pressures import (
@@ -103,19 +101,6 @@ def test_a_file_of_before_has_no_factor(fit, tmp_path):
     write_sealed(tmp_path / PRESSURES_FILE, entries, KIND)
     found = find_pressures(tmp_path, *SIZES)
     assert (found.factor, found.factor_sd) == (1.0, COMMON_FACTOR)
-
-
-def test_poses_for_the_payload_are_where_it_is_not_known(fit):
-    """Candidates and poses of which half are beyond those of the log: there one pose tells about others."""
-    spring_m, simulated_kpa, _ = poses(80, seed=6)
-    spring_m[40:] = 0.2 + 3.0 * (spring_m[40:] - 0.2)
-    at = PayloadPoses(spring_m, simulated_kpa, np.full((80, N), -4.0))
-    before_kg = payload_half_widths(fit.held, at, 0.0)
-    assert before_kg[40:].mean() > 2.0 * before_kg[:40].mean()
-    chosen = choose_for_payload(fit.held, at, *poses(1, seed=7)[:2], 1)
-    assert chosen.tolist() == [0]
-    chosen = choose_for_payload(fit.held, at, spring_m, simulated_kpa, 20)
-    assert len(set(chosen.tolist())) == 20 and np.mean(chosen >= 40) > 0.8
 
 
 def test_pressures_that_move_nothing_are_no_residual(four_chamber_arm):

@@ -113,7 +113,7 @@ def test_a_policy_is_adopted_and_may_observe_less(learner, start):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("new_share", -0.1)]
+    ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("horizon", 0)]
 )
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=f"learner.{name}: got {value}"):

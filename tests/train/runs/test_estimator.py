@@ -1,7 +1,5 @@
 """Distillation: held-out errors, payloads, same networks from the same seed, chambers without pressure."""
 
-import functools
-
 import jax
 import mujoco
 import numpy as np
@@ -13,7 +11,6 @@ from calib.fit.payload import told_payload
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import TOLERANCE_M, Gains, saturated
 from mjx_softarm.deploy.belief import explained_by_pressure_loss
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
@@ -106,8 +103,7 @@ def arms_at_rest(reference_m, payload_kg, dead):
         pressure_min_kpa=np.where(dead, 0.0, many.pressure_min_kpa).astype(np.float32),
         pressure_max_kpa=np.where(dead, 0.0, many.pressure_max_kpa).astype(np.float32),
     )
-    kinematics = chain_kinematics(params)
-    end = jax.device_get(jax.jit(jax.vmap(functools.partial(settle, kinematics)))(many, reference_m))
+    end = jax.device_get(jax.jit(jax.vmap(settle))(many, reference_m))
     winds = np.where(reference_m > end.spring_m, params.pressure_max_kpa, params.pressure_min_kpa)
     return end, np.where(dead, winds, end.pressure_kpa)
 
