@@ -12,8 +12,7 @@ import numpy as np
 from mjx_softarm._support.files import replacing
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import ObsScale, layouts
-from mjx_softarm.policy.actor import actor_layers, policy_from_actor
-from mjx_softarm.policy.file import action_layout, save_policy
+from mjx_softarm.policy.file import action_layout, actor_layers, policy_from_actor, save_policy
 from train.runs.arm_model import DistilledArm
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run
