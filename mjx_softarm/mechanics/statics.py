@@ -22,7 +22,6 @@ from jax import Array
 
 from mjx_softarm._support.small_matrices import block_diagonal, products
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
-from mjx_softarm.mechanics.contact import wall_terms
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.mechanics.params import ArmParams
 
@@ -226,13 +225,6 @@ def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
     # Second derivatives in two factors; within a section they are written out
     above, below = jnp.stack([axis[0], -axis[1]], axis=2), jnp.stack([w[1], w[0]], axis=2)
     gradient = w[2].reshape(-1, *arms)
-    if params.contact is not None:
-        push, *factors = wall_terms(params.contact, frames)
-        gradient = gradient + push
-        above, below = (
-            jnp.concatenate([own, more.reshape(*own.shape[:2], -1, *arms)], axis=2)
-            for own, more in zip((above, below), factors, strict=True)
-        )
     earlier_first = products(above, jnp.swapaxes(below, 1, 2))
     n = earlier_first.shape[1]
     upper = jnp.tri(n, dtype=bool).T.reshape(n, n, *[1] * len(arms))
