@@ -23,7 +23,6 @@ from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from train.agent.learner import Experience, Transition, check_settings
 
-
 NEAR_MM = (1.0, 100.0)  # distances of near goals; a millimetre goes with a turn of a degree
 
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm.sensing.pose import pose_error
 from train.agent import hindsight
 from train.agent.hindsight import HindsightConfig, later_pose, relabel
 from train.agent.learner import Experience
