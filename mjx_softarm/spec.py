@@ -122,9 +122,9 @@ def bonded_stiffness(share: Array, stiffness: Array, square_m2: Array) -> tuple[
     Returns:
         Stiffness [N/m] that each chamber gives; axial [N/m] and bending stiffness [N m/rad] of a section.
     """
-    given = share * stiffness.min(axis=1)
-    axial = stiffness.shape[1] * given
-    return given, axial, axial * square_m2 / 2
+    shared = share * stiffness.min(axis=1)
+    axial = stiffness.shape[1] * shared
+    return shared, axial, axial * square_m2 / 2
 
 
 @dataclass(frozen=True)
@@ -382,8 +382,8 @@ class ArmSpec:
 
         # A negative bond leaves the backbone some stiffness
         backbone = self.backbone.axial_stiffness_n_per_m, self.backbone.bending_stiffness_nm_per_rad
-        for own, bonded in zip(map(self.per_section, backbone), self._bonded(), strict=True):
-            if not np.all(np.add(own, bonded) > 0.0):
+        for stiffness, bonded in zip(map(self.per_section, backbone), self._bonded(), strict=True):
+            if not np.all(np.add(stiffness, bonded) > 0.0):
                 raise SpecError(
                     f"{source}: chambers.bonded_share: got {self.chambers.bonded_share!r}, which takes more "
                     "stiffness than the backbone has, expected a share closer to 0"

@@ -14,6 +14,7 @@ npz archive that any npz reader opens, with layers in float32 and other numbers 
     action_layout       (n,) text    names of the sensors' readings that the actions ask for
     action_centre       (n,)
     action_scale        (n,)         reading = centre + scale action
+    provenance_json     ()           how the actor came about: config, versions, commit
 
 What simulates is imported where it is needed, so that weights are written within seconds.
 """
@@ -21,6 +22,7 @@ What simulates is imported where it is needed, so that weights are written withi
 from __future__ import annotations
 
 import datetime
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -179,7 +181,7 @@ def actor_of(run: Run) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         RunError: the run has no checkpoint, or its policy is not a network that an export can hold.
     """
     try:
-        return actor_layers(run.policy(), run.spec.n_springs)
+        return actor_layers(run.policy(), run.spec)
     except (ValueError, AttributeError) as error:
         raise RunError(f"{run.path}: {error}") from error
 
@@ -202,6 +204,7 @@ def actor_entries(run: Run) -> dict[str, np.ndarray]:
         "action_layout": action_layout(spec),
         "action_centre": (actions.high + actions.low) / 2,
         "action_scale": (actions.high - actions.low) / 2,
+        "provenance_json": json.dumps({**run.origin(), "epoch": run.checkpoints.latest}),
     }
     arrays = {name: np.asarray(value) for name, value in entries.items()}
     Entries(arrays, str(run.path)).layers("actor", len(layout), spec.n_springs)
