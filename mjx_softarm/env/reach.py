@@ -251,8 +251,10 @@ class ReachEnv:
         if config.moves:
             moving = MovingArm(self.model, self._data, params, arm.moving)
             times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
-            engine = midpoint if config.engine == "chain" else mjx_step
-            return engine.advance(moving, arm.motion, reference_m, self.gains, *times_s)
+            told = moving, arm.motion, reference_m, self.gains, *times_s
+            if config.engine == "chain":
+                return midpoint.advance(*told, self.n_at_once)
+            return mjx_step.advance(*told)
         kinematics = MjxKinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
         end = settle(kinematics, params, reference_m, self.n_at_once)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
