@@ -76,7 +76,7 @@ def other_arm(request):
 @pytest.fixture(scope="session")
 def env(spec):
     """The paper's arm, quasi-static, chain engine, not randomised; as many poses as arms."""
-    return ReachEnv(spec, EnvConfig(n_poses=N_ARMS))
+    return ReachEnv(spec, EnvConfig(engine="chain", n_poses=N_ARMS))
 
 
 @pytest.fixture(scope="session")

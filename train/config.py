@@ -50,10 +50,7 @@ class TrainConfig:
     def with_policy_of(self, donor: TrainConfig) -> Self:
         """Return these settings for a run that begins with another's policy, with its hidden layers."""
         of_policy = {name: getattr(donor.learner, name) for name in ("hidden", "activation")}
-        learner = dataclasses.replace(self.learner, **of_policy)
-        if type(learner) is TQCConfig and self.env.moves:
-            learner = dataclasses.replace(learner, from_policy=True)
-        return dataclasses.replace(self, learner=learner)
+        return dataclasses.replace(self, learner=dataclasses.replace(self.learner, **of_policy))
 
     def evaluates_after(self, epoch: int) -> bool:
         """Return whether an evaluation and a checkpoint follow the n-th epoch."""

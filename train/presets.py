@@ -30,7 +30,7 @@ _TUNED = TQCConfig(
 # goals uniform in volume are within 3.8 mm, of those of random pressures 0.75; with four fifths 2.9 and 0.79.
 # `payload` has more to learn: halfway through a training its circle is 0.51 mm off with these, 0.32 with
 # half.
-_EVEN = EnvConfig(n_poses=4_096, even_share=0.8)
+_EVEN = EnvConfig(engine="chain", n_poses=4_096, even_share=0.8)  # the learner descends its gradient
 _MOVING = EnvConfig(
     mode="dynamic",
     observation="motion",
@@ -174,13 +174,5 @@ IMITATION_PRESETS: dict[str, TrainConfig] = {
     "paper-pipe": TrainConfig(
         learner=dataclasses.replace(_PRINTED, total_env_steps=1_000_000, rebalance_env_steps=100_000),
         evaluation_epochs=14,
-    ),
-    # Half-second actions in motion. Payloads as they are carried: they change how the arm moves.
-    "pipe-moving": TrainConfig(
-        learner=_PIPE,
-        evaluation_epochs=2,
-        env=dataclasses.replace(
-            _MOVING, randomisation=dataclasses.replace(_MOVING.randomisation, payload_max_kg=0.25)
-        ),
     ),
 }

@@ -100,7 +100,7 @@ class HindsightBuffer(HerReplayBuffer):
         draws = self._rng.random((2, len(after)), np.float32)
         near = draws[0] < self._hindsight.near_share / self.her_ratio
         direction = self._rng.standard_normal((len(after), 6), np.float32)
-        offsets = near_offsets(jnp.asarray(draws[1]), jnp.asarray(direction), self._hindsight)
+        offsets = near_offsets(jnp.asarray(draws[1]), jnp.asarray(direction))
         goals = np.where(near[:, None], after + np.asarray(offsets), goals)
         # Rewards, observations and termination for the new goals.
         n_steps = (batch_indices - self.ep_start[where]) % self.buffer_size + 1

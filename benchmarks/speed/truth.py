@@ -12,14 +12,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.sharding import Mesh
 
 from mjx_softarm._support import xla
-from mjx_softarm._support.lazy import mjx
+from mjx_softarm._support.lazy import put
 from mjx_softarm.env.vector import over_arms
 from mjx_softarm.mechanics import settle as solver
-from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.mjx_rest import measured
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import ArmSpec
 
@@ -41,11 +42,13 @@ def settle_function(
     """Return a jitted function, references (n, n_springs) -> `Settled`, spread over a mesh of devices."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
     n_at_once = solver.arms_at_once(spec.n_links)
-    if engine == "mjx":
-        kinematics = MjxKinematics(mjx.put_model(build_model(spec)))
-    else:
-        kinematics = chain_kinematics(params)
-    return xla.jit(over_arms(lambda r: solver.settle(kinematics, params, r, n_at_once), mesh))
+    model, data = put(build_model(spec)) if engine == "mjx" else (None, None)
+
+    def at_rest(reference_m: Array) -> solver.Settled:
+        proposed = solver.settle(params, reference_m, n_at_once)
+        return proposed if model is None else measured(model, data, params, proposed)
+
+    return xla.jit(over_arms(at_rest, mesh))
 
 
 @functools.lru_cache(maxsize=8)

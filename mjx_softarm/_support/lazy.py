@@ -1,8 +1,8 @@
 """Modules that are imported when they are first used, so that commands without them begin quickly.
 
-MuJoCo and MJX take more than a second, and arms at rest need neither. `mujoco.mjx` prints two lines at import
-if warp is not installed. Only the engine "warp" needs it, so these lines are held back. MJX has not enough
-types to be checked.
+MuJoCo and MJX take more than a second, and calibration seldom needs them. `mujoco.mjx`, which brax imports,
+prints two lines at import if warp is not installed. Only the engine "warp" needs it, so these lines are held
+back. MJX has not enough types to be checked.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import jax
 
 from mjx_softarm._support.errors import InputError
 
-__all__ = ["LazyModule", "mjx", "mujoco", "put"]
+__all__ = ["LazyModule", "brax_envs", "mjx", "mujoco", "put"]
 
 
 class LazyModule:
@@ -44,9 +44,11 @@ def _import_quietly(name: str) -> Any:
 
 if TYPE_CHECKING:
     import mujoco
+    from brax import envs as brax_envs
     from mujoco import mjx
 else:
     mujoco, mjx = LazyModule("mujoco"), LazyModule("mujoco.mjx", _import_quietly)
+    brax_envs = LazyModule("brax.envs", _import_quietly)
 
 
 def put(model: mujoco.MjModel, warp: bool = False) -> tuple[mjx.Model, mjx.Data]:

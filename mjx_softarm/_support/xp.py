@@ -1,4 +1,4 @@
-"""One source for NumPy and JAX: the functions of an array's own library."""
+"""One source for NumPy, JAX and recorded symbols: the functions of an array's own library, and a solver."""
 
 from __future__ import annotations
 
@@ -16,3 +16,17 @@ def array_namespace(*arrays: Array) -> ModuleType:
         if hasattr(array, "__array_namespace__") and not isinstance(array, (np.ndarray, np.generic)):
             return array.__array_namespace__()
     return np
+
+
+def solve(matrix: Array, column: Array) -> Array:
+    """Solve positive definite systems (..., n, n) for columns (..., n), by Gauss-Jordan elimination.
+
+    It uses only operations that exports have. No rows change places.
+    """
+    xp, n = array_namespace(matrix, column), matrix.shape[-1]
+    left = xp.concat([matrix, column[..., None]], axis=-1)  # (..., n, n + 1 - k)
+    for k in range(n):
+        row = left[..., k : k + 1, 1:] / left[..., k : k + 1, :1]
+        cleared = left[..., 1:] - left[..., :1] * row
+        left = xp.where(np.arange(n)[:, None] == k, row, cleared)
+    return left[..., 0]

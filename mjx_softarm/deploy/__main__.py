@@ -37,7 +37,6 @@ from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.logs.files import check_file
-from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import SHIPPED, load_policy
@@ -221,7 +220,6 @@ def _record(
     out: Path,
     spec: cli.SpecFile = None,
     poses: int = 500,
-    plan: cli.MaybePath = None,
     seed: int = 0,
     transients: bool = False,
 ) -> int:
@@ -230,7 +228,6 @@ def _record(
     Args:
         out: log to write, CSV or npz
         poses: number of random poses
-        plan: pressures in place of random ones, from `python -m calib plan`
         seed: seed of the poses
         transients: log every tick, not the static poses alone
     """
@@ -252,7 +249,7 @@ def _record(
         tell(f"{on.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results
-    targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
+    targets_kpa = growing(random_pressures(arm_spec, poses, seed))
     result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out))
     finish(driver, tell)
     if not len(result.log):

@@ -175,7 +175,7 @@ def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> Iterato
         yield Event(Fault.LOAD_UNKNOWN, text)
     elif belief.width_kg > config.load_known * most_kg:
         text = f"payload not known better than {1e3 * belief.width_kg:.0f} g, expected "
-        text += f"{1e3 * config.load_known * most_kg:.0f} g: record the poses of `python -m calib plan`; "
+        text += f"{1e3 * config.load_known * most_kg:.0f} g: record more random poses; "
         yield Event(Fault.LOAD_UNKNOWN, text + believed)
     if load.began and load.kg < watch.load_kg:
         text = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * watch.load_kg:.0f} g before"

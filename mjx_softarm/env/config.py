@@ -16,7 +16,8 @@ from mjx_softarm.mechanics.pipe import Contact, CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.spec import ArmSpec
 
-Engine = Literal["chain", "mjx", "warp"]
+Engine = Literal["mjx", "chain", "mjx-step", "warp"]
+ENGINES = {"quasistatic": ("mjx", "chain"), "dynamic": ("mjx", "mjx-step", "warp")}  # by mode
 
 
 def _expect(config: Any, name: str, holds: bool, expected: str) -> None:
@@ -52,9 +53,10 @@ class Randomisation:
 class EnvConfig:
     """Simulation, reward and randomisation of `ReachEnv`."""
 
-    engine: Annotated[Engine, arg(aliases=["--engine"])] = "chain"
-    """at rest, kinematics in closed form (chain) or by MJX; in motion, this project's own time step (chain),
-    `mjx.step` of the compiled model (mjx), or the same by MJX-Warp, which needs a GPU and warp-lang (warp)"""
+    engine: Annotated[Engine, arg(aliases=["--engine"])] = "mjx"
+    """at rest, MJX's kinematics, tendons and forces at equilibria that the closed form proposes (mjx), or the
+    closed form alone (chain); in motion, MJX's inertia in this project's own time step (mjx), `mjx.step` of
+    the compiled model (mjx-step), or the same by MJX-Warp, which needs a GPU and warp-lang (warp)"""
     mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
     """an action leads to its equilibrium, or moves the arm for a while"""
     links_per_section: int | None = None
@@ -72,11 +74,10 @@ class EnvConfig:
     workspace_seed: int = 0  # seed of the poses
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
     simulation_step_s: float = 0.02
-    """time step in dynamic mode, at most; no longer than a control period. By mjx.step, 0.002 is as exact as
-    0.02 by the engine chain"""
+    """time step in dynamic mode, at most; no longer than a control period. By mjx-step, 0.002 is as exact as
+    0.02 by mjx"""
     pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
     """cross-shaped pipe around the arm"""
-    pipe_lip_mm: float = 0.0  # length of the plates that hang from the upper edges of its side branches
     pipe_contact: bool = False
     """the wall acts on the simulated arm; else it is there for clearances alone"""
     clearance_cost_per_mm: float = 0.0  # cost per mm of clearance below the margin
@@ -85,9 +86,7 @@ class EnvConfig:
     @property
     def pipe(self) -> CrossPipe | None:
         """Pipe around the arm, if there is one."""
-        if self.pipe_diameter_mm is None:
-            return None
-        return CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)
+        return None if self.pipe_diameter_mm is None else CrossPipe.of_mm(self.pipe_diameter_mm)
 
     def contact(self, spec: ArmSpec) -> Contact | None:
         """Return the contact of an arm with the pipe, if its wall acts."""
@@ -121,12 +120,13 @@ class EnvConfig:
     def __post_init__(self):
         # Names
         for name, allowed in (
+            ("mode", tuple(ENGINES)),
             ("engine", get_args(Engine)),
-            ("mode", ("quasistatic", "dynamic")),
             ("observation", get_args(Observation)),
         ):
             _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
-        _expect(self, "engine", self.moves or self.engine != "warp", "'chain' or 'mjx' for arms at rest")
+        allowed = ENGINES[self.mode]
+        _expect(self, "engine", self.engine in allowed, f"one of {allowed} with the mode {self.mode!r}")
         known = self.moves or self.observation != "motion"
         _expect(self, "observation", known, "'pose' or 'payload' for arms at rest")
 
@@ -152,15 +152,15 @@ class EnvConfig:
         _expect(self.randomisation, "friction_max_n", no_friction, "0 with the engine 'warp'")
 
         # Pipe
-        for name in ("clearance_cost_per_mm", "pipe_lip_mm", "pipe_contact"):
+        for name in ("clearance_cost_per_mm", "pipe_contact"):
             without = self.pipe_diameter_mm is not None or not getattr(self, name)
             _expect(self, name, without, f"{type(getattr(self, name))()!r} without a pipe_diameter_mm")
-        other_engine = self.moves and self.engine != "chain"
+        other_engine = self.engine != ("mjx" if self.moves else "chain")
         _expect(
             self,
             "pipe_contact",
             not (self.pipe_contact and other_engine),
-            f"False with the engine {self.engine!r} in motion",
+            f"False with the engine {self.engine!r} and the mode {self.mode!r}",
         )
         if self.pipe_diameter_mm is not None:
-            CrossPipe.of_mm(self.pipe_diameter_mm, self.pipe_lip_mm)  # raises ValueError
+            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError

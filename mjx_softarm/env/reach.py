@@ -2,6 +2,7 @@
 
 An action is one sensor reading per spring, scaled to [-1, 1]; the sensor-space law turns it into pressures.
 `mode="quasistatic"` goes to the equilibrium at once; `mode="dynamic"` moves the arm, with chambers that fill.
+MJX simulates both, see `EnvConfig.engine`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
-from mjx_softarm._support.lazy import put
+from mjx_softarm._support.lazy import brax_envs, put
 from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
 from mjx_softarm.env.poses import PosePool
@@ -21,7 +22,7 @@ from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeMotion, Episod
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
-from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
+from mjx_softarm.mechanics import mjx_rest
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.motion import midpoint, mjx_step
 from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm
@@ -33,8 +34,8 @@ from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 
 
-class ReachEnv:
-    """A soft arm that reaches for poses of its workspace.
+class ReachEnv(brax_envs.Env):
+    """A soft arm that reaches for poses of its workspace; brax's registry has it as "soft_arm".
 
     A pose is the tip's x, y, z [mm] and yaw, pitch, roll [deg] in the base frame, z up. For the paper's arm:
 
@@ -83,7 +84,7 @@ class ReachEnv:
         self.walls = Walls(self.config.pipe, self.spec, self.params, s2r)
 
         # Simulation, and the poses that starts and goals are drawn from
-        self.uses_mjx = self.config.engine != "chain" or self.config.moves
+        self.uses_mjx = self.config.engine != "chain"
         warp, self.n_at_once = self.config.engine == "warp", arms_at_once(self.spec.n_links)
         self.model, self._data = put(build_model(self.spec), warp) if self.uses_mjx else (None, None)
         self._results = MotionResult if self.config.moves else SettleResult
@@ -116,10 +117,6 @@ class ReachEnv:
     @property
     def action_size(self) -> int:
         return self.spec.n_springs
-
-    @property
-    def unwrapped(self) -> ReachEnv:
-        return self
 
     @property
     def backend(self) -> str:
@@ -252,11 +249,12 @@ class ReachEnv:
             moving = MovingArm(self.model, self._data, params, arm.moving)
             times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
             told = moving, arm.motion, reference_m, self.gains, *times_s
-            if config.engine == "chain":
+            if config.engine == "mjx":
                 return midpoint.advance(*told, self.n_at_once)
             return mjx_step.advance(*told)
-        kinematics = MjxKinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
-        end = settle(kinematics, params, reference_m, self.n_at_once)
+        end = settle(params, reference_m, self.n_at_once)
+        if config.engine == "mjx":
+            end = mjx_rest.measured(self.model, self._data, params, end)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
     def _way(self, arm: ArmState, end: Settled | MotionEnd, valid: Array) -> dict[str, Array]:
@@ -300,3 +298,6 @@ class ReachEnv:
             tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].set(arm.payload_kg),
             chamber_stiffness=arm.chamber_stiffness,
         )
+
+
+brax_envs.register_environment("soft_arm", ReachEnv)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm._support.lazy import brax_envs
 from mjx_softarm.env.config import EnvConfig, Randomisation
 from mjx_softarm.mechanics.motion.state import Motion, MotionParams, n_earlier
 from mjx_softarm.mechanics.workspace import Pool
@@ -21,23 +22,6 @@ from mjx_softarm.spec import ArmSpec
 
 for _sensor in SENSORS.values():
     jax.tree_util.register_dataclass(_sensor)  # its numbers are traced
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class State:
-    """State of an environment, with the fields of `brax.envs.State`; brax's wrappers take it as theirs."""
-
-    pipeline_state: Any  # `ArmState`
-    obs: Array
-    reward: Array
-    done: Array
-    metrics: dict[str, Array]
-    info: dict[str, Any]
-
-    def replace(self, **fields: Any) -> State:
-        """Return the state with other values of some fields."""
-        return dataclasses.replace(self, **fields)
 
 
 PAYLOAD_SHARE = 2  # index in `EpisodeNoise.uniform`
@@ -65,6 +49,18 @@ class ArmState(NamedTuple):
     sensed: Array | None  # (k,) observations besides pose and goal; None if there are none
     goal: Array  # (6,) [mm, deg]
     n_steps: Array  # () actions taken in this episode
+
+
+@flax.struct.dataclass
+class State(brax_envs.State):
+    """State of an environment: brax's, with an arm in the place of brax's pipeline state."""
+
+    pipeline_state: ArmState
+    obs: Array
+
+    if TYPE_CHECKING:  # flax adds it, unknown to type checkers
+
+        def replace(self, **fields: Any) -> State: ...
 
 
 class EpisodeMotion:

@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm.mechanics.kinematics import Frames
-from mjx_softarm.mechanics.pipe import Contact, CrossPipe, lip_distance
+from mjx_softarm.mechanics.pipe import Contact, CrossPipe
 
 STIFFNESS_N_PER_M = 1e4  # of a ball; in single precision, its force is then exact to 1e-3 N
 RAMP_M = 3e-3  # depth over which the stiffness grows: 1 N at 0.8 mm, 5 N at 1.7 mm
@@ -115,10 +115,7 @@ def is_jammed(contact: Contact, frames: Frames) -> Array:
 def _gaps(contact: Contact, centre: Array) -> Array:
     """Return the least gaps (k, *arms) [m] of balls with these centres (3, k, *arms) [m]."""
     radius = np.array(contact.radius_m, centre.dtype).reshape(-1, *[1] * (centre.ndim - 2))
-    gap = pipe_distance(contact.pipe, centre)
-    if contact.pipe.lip_m:
-        gap = jnp.minimum(gap, lip_distance(contact.pipe, jnp.moveaxis(centre, 0, -1)))
-    return gap - radius
+    return pipe_distance(contact.pipe, centre) - radius
 
 
 def _derivatives(contact: Contact, centre: Array) -> tuple[Array, list[Array]]:
@@ -142,11 +139,7 @@ def _axes(centre: Array) -> list[Array]:
 
 def _energy(contact: Contact, centre: Array) -> Array:
     """Return the energies (k, *arms) [J] of balls with these centres (3, k, *arms) [m]."""
-    radius = np.array(contact.radius_m, centre.dtype).reshape(-1, *[1] * (centre.ndim - 2))
-    energy = _phi(pipe_distance(contact.pipe, centre) - radius)
-    if contact.pipe.lip_m:
-        energy += _phi(lip_distance(contact.pipe, jnp.moveaxis(centre, 0, -1)) - radius)
-    return energy
+    return _phi(_gaps(contact, centre))
 
 
 def _phi(gap: Array) -> Array:

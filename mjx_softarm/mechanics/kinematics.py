@@ -12,7 +12,7 @@ Many arms come last in every shape, (..., *arms): one instruction then serves se
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,22 +38,10 @@ class Frames(NamedTuple):
     tip_rotation: Array  # (3, 3, *arms)
 
 
-class Kinematics(Protocol):
-    """Kinematics of one engine: a pytree of the numbers that the frames depend on."""
-
-    arms_last: ClassVar[bool]  # takes many arms (nv, *arms) at once; else one arm (nv,)
-
-    def __call__(self, q: Array) -> Frames:
-        """Return the frames at joint coordinates (nv, *arms) [m, rad, rad]."""
-        ...
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ChainKinematics:
     """Closed form: products of the links' rotations, sums of the links' vectors."""
-
-    arms_last: ClassVar[bool] = True
 
     link_length_m: Array | np.ndarray  # (n_links, *arms) distance of a link's plates at rest
     mount: Mount = LEVEL
@@ -104,21 +92,16 @@ def chain_kinematics(params: ArmParams) -> ChainKinematics:
     return ChainKinematics(params.link_length_m, params.mount)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class MjxKinematics:
-    """`mjx.kinematics` of a compiled arm on the device."""
-
-    arms_last: ClassVar[bool] = False
-
-    model: mjx.Model  # from `mjx_softarm.mechanics.mjcf`: bodies are world and links, the last site the tip
-
-    def __call__(self, q: Array) -> Frames:
-        return frames_of(self.model, mjx.kinematics(self.model, mjx.make_data(self.model).replace(qpos=q)))
+def tip_of(data: mjx.Data) -> tuple[Array, Array]:
+    """Return the tip's position (3,) [m] and rotation (3, 3) from MJX's data; its site is the last."""
+    return data.site_xpos[-1], data.site_xmat[-1].reshape(3, 3)
 
 
 def frames_of(model: mjx.Model, data: mjx.Data) -> Frames:
-    """Return the frames of one arm from MJX's data after its kinematics."""
+    """Return the frames of one arm from MJX's data after its kinematics.
+
+    The model is from `mjx_softarm.mechanics.mjcf`: its bodies are the world, links and tools.
+    """
     # A body's origin is its hinges' anchor; its plate hangs half a link below
     n_links = len(data.qpos) // DOFS_PER_LINK
     links = slice(1, n_links + 1)  # the world comes first
@@ -132,8 +115,8 @@ def frames_of(model: mjx.Model, data: mjx.Data) -> Frames:
         plate_rotation=jnp.concatenate([base[None], rotation]),
         axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
         anchor=anchor,
-        tip_position=data.site_xpos[-1],
-        tip_rotation=data.site_xmat[-1].reshape(3, 3),
+        tip_position=tip_of(data)[0],
+        tip_rotation=tip_of(data)[1],
     )
 
 

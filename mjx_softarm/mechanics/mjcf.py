@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from mjx_softarm._support.lazy import mujoco
+from mjx_softarm._support.lazy import mjx, mujoco
 from mjx_softarm._support.xp import Array
 from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
 from mjx_softarm.mechanics.params import ArmParams
@@ -88,6 +89,17 @@ def build_model(spec: ArmSpec) -> mujoco.MjModel:
     return build_spec(spec).compile()
 
 
+def episode_model(model: mjx.Model, params: ArmParams) -> mjx.Model:
+    """Return a model on the device with the masses and the tendons' stiffnesses of `params`."""
+    mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
+    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
+    return model.replace(
+        body_mass=mass,
+        body_inertia=model.body_inertia * scale[:, None],
+        tendon_stiffness=jnp.concatenate([params.chamber_stiffness, params.spring_stiffness]),
+    )
+
+
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     """Add one link: a slide along the parent plate's -z, then hinges x and y half a link below it."""
     # Body and its inertia, that of a solid cylinder about its centre
@@ -138,9 +150,9 @@ def _add_holes(body, plate: int, section: int, position, params: ArmParams) -> N
     """Add the sites that the chambers and springs of `section` pass on a plate."""
     for kind, site_m in (("chamber", params.chamber_site_m), ("spring", params.spring_site_m)):
         n = site_m.shape[1]
-        for k, at in enumerate(site_m[section]):
+        for k, place in enumerate(site_m[section]):
             name = f"{kind}{section * n + k}_plate{plate}"
-            body.add_site(name=name, pos=position + [*at, 0.0], size=[0.001] * 3)
+            body.add_site(name=name, pos=position + [*place, 0.0], size=[0.001] * 3)
 
 
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:

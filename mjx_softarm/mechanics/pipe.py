@@ -19,7 +19,6 @@ from mjx_softarm.spec import ArmSpec
 # Objects that the arm picks and places. Source: the paper's section on confined scenarios.
 BALL_KG = 0.035  # a sponge ball
 APPLE_KG = 0.220
-LIP_HALF_M = 0.005  # half the thickness of a lip, whose edge is round
 RIM_BALLS, RIM_BALL_M = 8, 0.01  # balls that stand for a ring near the tip, and their radius
 RIM_POINTS = 16  # points of a ring; its rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
 
@@ -34,7 +33,6 @@ class CrossPipe:
     top_z_m: float = 0.0  # the outlet that the arm enters, level with its base
     reach_m: float = 0.06  # depth of the containers in a branch; the nominal arm reaches 5 mm further
     drop_m: float = 0.05  # height of a branch's axis over the left and the right container
-    lip_m: float = 0.0  # length of the plates that hang from the upper edges of the left and the right branch
 
     def __post_init__(self) -> None:
         if not 0.0 < self.radius_m < self.branch_m - self.reach_m:
@@ -42,13 +40,11 @@ class CrossPipe:
                 f"diameter_m: got {self.diameter_m!r}, expected more than 0 and less than "
                 f"{2 * (self.branch_m - self.reach_m):g}, so that the branches hold their containers"
             )
-        if not 0.0 <= self.lip_m < self.diameter_m:
-            raise ValueError(f"lip_m: got {self.lip_m!r}, expected 0 or more and less than the diameter")
 
     @classmethod
-    def of_mm(cls, diameter_mm: float, lip_mm: float = 0.0) -> CrossPipe:
-        """Return the pipe of this inner diameter, with lips of this length."""
-        return cls(1e-3 * diameter_mm, lip_m=1e-3 * lip_mm)
+    def of_mm(cls, diameter_mm: float) -> CrossPipe:
+        """Return the pipe of this inner diameter."""
+        return cls(1e-3 * diameter_mm)
 
     @property
     def radius_m(self) -> float:
@@ -68,8 +64,6 @@ PIPES = {
     "pipe300": CrossPipe.of_mm(300.0),
     "pipe250": CrossPipe.of_mm(250.0),
     "pipe200": CrossPipe.of_mm(200.0),
-    "lip300": CrossPipe.of_mm(300.0, lip_mm=80.0),
-    "lip250": CrossPipe.of_mm(250.0, lip_mm=80.0),
 }
 
 
@@ -120,20 +114,7 @@ def clearance(pipe: CrossPipe, position_m: Array) -> Array:
     xp = array_namespace(position_m)
     x, y, z = (position_m[..., k] for k in range(3))
     vertical, horizontal = (_norm(xp, a, y) for a in (x, z - pipe.centre_z_m))
-    free = pipe.radius_m - xp.minimum(vertical, horizontal)
-    return xp.minimum(free, lip_distance(pipe, position_m)) if pipe.lip_m else free
-
-
-def lip_distance(pipe: CrossPipe, position_m: Array) -> Array:
-    """Return the distance (...) [m] of positions (..., 3) [m] to the nearer lip, negative within it.
-
-    A lip is a plate at right angles to x, flush with the vertical pipe, from wall to wall.
-    """
-    xp = array_namespace(position_m)
-    top_z = pipe.centre_z_m + pipe.radius_m
-    aside = abs(position_m[..., 0]) - pipe.radius_m - LIP_HALF_M
-    beyond = position_m[..., 2] - xp.clip(position_m[..., 2], top_z - pipe.lip_m, top_z)
-    return _norm(xp, aside, beyond) - LIP_HALF_M
+    return pipe.radius_m - xp.minimum(vertical, horizontal)
 
 
 def _norm(xp, a: Array, b: Array) -> Array:
@@ -166,21 +147,8 @@ def _turned(rotation: Array, point: np.ndarray) -> Array:
 
 
 def body_clearance(pipe: CrossPipe, plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
-    """Return the least of the `body_clearances` (...) [m]."""
-    return body_clearances(pipe, plate_position, plate_rotation, spec).min(axis=-1)
-
-
-def body_clearances(pipe: CrossPipe, plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
-    """Return the `clearance` (..., k) [m] of the `body_points`, then that of balls at the rings to the lips.
-
-    A lip's edge could pass between the points of two rings, where it meets their balls.
-    """
-    free = clearance(pipe, body_points(plate_position, plate_rotation, spec))
-    if not pipe.lip_m:
-        return free
-    is_ball = ball_rings(spec)
-    to_lip = lip_distance(pipe, plate_position[..., is_ball, :]) - ring_radius_m(spec)[is_ball]
-    return array_namespace(free).concat([free, to_lip], axis=-1)
+    """Return the least `clearance` (...) [m] of the `body_points`."""
+    return clearance(pipe, body_points(plate_position, plate_rotation, spec)).min(axis=-1)
 
 
 def _gripper(spec: ArmSpec) -> np.ndarray:

@@ -43,7 +43,7 @@ def policy_from_actor(
             array has the wrong shape or is not finite.
     """
     policy = Policy(
-        layers=_layers_from_flax(actor_params, spec.n_springs),
+        layers=actor_layers(actor_params, spec),
         obs_scale=ObsScale.from_spec(spec),
         reward=reward,
         actions=ActionMap.from_spec(spec),
@@ -58,17 +58,16 @@ def policy_from_actor(
     return checked(policy)
 
 
-def check_actor(actor_params: Mapping[str, Any], spec: ArmSpec) -> None:
-    """Raise ValueError where parameters, as for `policy_from_actor`, do not belong to an actor."""
-    _layers_from_flax(actor_params, spec.n_springs)
+def actor_layers(actor_params: Mapping[str, Any], spec: ArmSpec) -> tuple[Layer, ...]:
+    """Return the actor's layers without its standard deviations; only this function knows flax's names.
 
-
-def _layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
-    """Return the actor's layers without its standard deviations; only this function knows flax's names."""
+    Raises:
+        ValueError: the parameters, as for `policy_from_actor`, do not belong to an actor.
+    """
     dense = actor_params.get("params", {})
     names = [*(f"hidden_{k}" for k in range(len(dense) - 1)), "head"]
     if set(dense) != set(names):
         raise ValueError(f"actor parameters: got {sorted(dense)}, expected hidden_0, hidden_1, ... and head")
     arrays = [[np.asarray(dense[name][part], np.float32) for part in ("kernel", "bias")] for name in names]
-    arrays[-1] = [array[..., :n_actions] for array in arrays[-1]]
+    arrays[-1] = [array[..., : spec.n_springs] for array in arrays[-1]]
     return tuple((weight, bias) for weight, bias in arrays)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_softarm._support.xp import Array, array_namespace
+from mjx_softarm._support.xp import Array, array_namespace, solve
 from mjx_softarm.control import at_chambers, planes
 from mjx_softarm.mdp.rewards import weighted_angles, weighted_error, weighted_position
 from mjx_softarm.policy.file import Policy
@@ -58,7 +58,7 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     slope, gradient = xp.where(free[..., None], slope, 0.0), xp.where(free, gradient, 0.0)
     # Take the step where it helps; else only raise the damping.
     curvature = slope @ xp.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
-    tried = xp.clip(share - solved(curvature, gradient), 0.0, 1.0)
+    tried = xp.clip(share - solve(curvature, gradient), 0.0, 1.0)
     helped = xp.sum((_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
     damping = xp.clip(damping * xp.where(helped, _EASE, _STIFFEN), _LEAST_DAMPING, _MOST_DAMPING)
     return xp.concat([xp.where(helped[:, None], tried, share), damping[:, None]], axis=1)
@@ -127,17 +127,6 @@ def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
     return xp.concat([position, turn.reshape(*turn.shape[:-2], 9)], axis=-1)
 
 
-def solved(matrix: Array, column: Array) -> Array:
-    """Solve positive definite systems (rows, n, n) for columns (rows, n), by Gauss-Jordan elimination."""
-    xp, n = array_namespace(matrix, column), matrix.shape[-1]
-    left = xp.concat([matrix, column[..., None]], axis=-1)  # (rows, n, n + 1 - k)
-    for k in range(n):
-        row = left[:, k, 1:] / left[:, k, :1]
-        cleared = left[..., 1:] - left[..., :1] * row[:, None]
-        left = xp.where(np.arange(n)[:, None] == k, row[:, None], cleared)
-    return left[..., 0]
-
-
 def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array, policy: Policy) -> Array:
     """Return the lengths (n_springs,) [m] that an arm at rest takes for new references. NumPy and symbols.
 
@@ -164,5 +153,5 @@ def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array
     weight = xp.where(stays, _STAYING, 1.0).reshape(n_sections, 1, n)
     across, along_m = planes(n).T, xp.where(stays, 0.0, move_m).reshape(n_sections, 1, n)
     normal = xp.sum((weight * across)[:, :, None] * across, axis=-1)  # (n_sections, 3, 3)
-    plane = solved(normal, xp.sum(weight * across * along_m, axis=-1))  # (n_sections, 3)
+    plane = solve(normal, xp.sum(weight * across * along_m, axis=-1))  # (n_sections, 3)
     return mean_m + xp.sum(plane[:, None] * planes(policy.spec.springs_per_section), axis=-1).reshape(-1)

@@ -30,7 +30,7 @@ import numpy as np
 
 from mjx_softarm._support.archive import Entries
 from mjx_softarm._support.mlp import Layer, mlp
-from mjx_softarm._support.xp import Array, array_namespace
+from mjx_softarm._support.xp import Array, array_namespace, solve
 
 N_AVERAGED = 8  # number of estimates in the moving average
 # An outlier is off the average by more than this share of the largest payload, and their intervals are apart.
@@ -136,23 +136,10 @@ def estimate_load(
     own = np.eye(effect.shape[-1], dtype=estimator.slope.dtype) * (OWN_FACTOR * effect[..., None]) ** 2
     kg = variance = xp.zeros_like(effect[..., 0, 0])
     for _ in range(N_PASSES):
-        weight = _solved(known + (kg**2)[..., None, None, None] * own, effect)
+        weight = solve(known + (kg**2)[..., None, None, None] * own, effect)
         variance = 1.0 / xp.sum(weight * effect, axis=(-2, -1))
         kg = variance * xp.sum(weight * left_kpa, axis=(-2, -1))
     return estimator.own_load_kg + kg, QUANTILE * xp.sqrt(variance + (estimator.factor_sd * kg) ** 2)
-
-
-def _solved(matrix: Array, right: Array) -> Array:
-    """Return x (..., c) of `matrix` (..., c, c) x = `right` (..., c), by elimination.
-
-    The matrix is positive definite, so no rows need to change places. Only operations that exports have.
-    """
-    c, xp = right.shape[-1], array_namespace(matrix, right)
-    rows = xp.concat([matrix, right[..., None]], axis=-1)
-    for k in range(c):
-        pivot = rows[..., k : k + 1, :] / rows[..., k : k + 1, k : k + 1]
-        rows = xp.where(np.arange(c)[:, None] == k, pivot, rows - rows[..., k : k + 1] * pivot)
-    return rows[..., c]
 
 
 def holds_payload(estimate_kg: float, half_width_kg: float, largest_kg: float) -> bool:

@@ -91,10 +91,10 @@ def quaternion_from_rotation(rotation: Array) -> Array:
 
 
 def rotation_about(vector_rad: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) about a vector (3,) by its length [rad]. NumPy only."""
-    half = 0.5 * np.linalg.norm(vector_rad)
+    """Return the rotations (..., 3, 3) about vectors (..., 3) by their lengths [rad]. NumPy only."""
+    half = 0.5 * np.linalg.norm(vector_rad, axis=-1, keepdims=True)
     sine = 0.5 * np.sinc(half / np.pi) * np.asarray(vector_rad, float)
-    return rotation_from_quaternion(np.append(np.cos(half), sine))
+    return rotation_from_quaternion(np.concatenate([np.cos(half), sine], axis=-1))
 
 
 def rotation_vector(rotation: np.ndarray) -> np.ndarray:

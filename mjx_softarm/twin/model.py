@@ -26,6 +26,7 @@ from mjx_softarm._support.fields import PerChamber, scaled
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
+from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import Build, drawn, scaled_tolerances
@@ -114,7 +115,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
         link_mass=1.0 + off(std.link_mass, perturbed.n_links),
         hysteresis=1.0 + off(std.chamber_hysteresis, n),
         base_position_m=mounting.base_offset_m + off(std.base_offset_m, 3),
-        base_rotation=rotation_matrix(np.radians(mounting.base_turn_deg)) @ rotation_matrix(tilt_rad),
+        base_rotation=rotation_about(np.radians(mounting.base_turn_deg)) @ rotation_about(tilt_rad),
     )
 
 
@@ -181,13 +182,5 @@ def _mount(mjspec: mujoco.MjSpec, kind: str, hole_m: np.ndarray, parts: Parts) -
         cos, sin = np.cos(parts.twist_rad[section]), np.sin(parts.twist_rad[section])
         for k in range(per_section + 1):
             site = mjspec.site(f"{kind}{index}_plate{section * per_section + k}")
-            at = [cos * x - sin * y, sin * x + cos * y] if k == 0 else [x, y]
-            site.pos = [*at, site.pos[2]]
-
-
-def rotation_matrix(vector_rad: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) about a vector (3,) by its length [rad]."""
-    angle, quaternion, matrix = float(np.linalg.norm(vector_rad)), np.zeros(4), np.zeros(9)
-    mujoco.mju_axisAngle2Quat(quaternion, vector_rad / max(angle, np.finfo(float).tiny), angle)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
+            place = [cos * x - sin * y, sin * x + cos * y] if k == 0 else [x, y]
+            site.pos = [*place, site.pos[2]]

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from mjx_softarm.mechanics.body import gripper_boxes, rim_points, ring_radius_m
-from mjx_softarm.mechanics.pipe import LIP_HALF_M, CrossPipe
+from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.spec import ArmSpec
 
 N_PLANKS = 24  # planks around a branch; a multiple of four puts none across the plane of the two axes
@@ -99,29 +99,22 @@ def _walls(pipe: CrossPipe):
             corners = [np.stack(place(across, y, along), axis=-1) for along in ends]
             group = 0 if sin > 0.0 else _UNSEEN
             yield f"{WALL}_{branch}{k}", centre + np.concatenate(corners), _WALL_COLOUR, group
-    # Lips, each in two halves.
-    top = pipe.centre_z_m + pipe.radius_m
-    for side, half in itertools.product((-1.0, 1.0), (-1.0, 1.0)) if pipe.lip_m else ():
-        x = side * (pipe.radius_m + 2.0 * LIP_HALF_M * np.array([0.0, 1.0]))
-        y, z = half * np.array([0.0, pipe.radius_m]), (top - pipe.lip_m, top)
-        corners = np.array([*itertools.product(x, y, z)])
-        yield f"{WALL}_lip{side:+g}{half:+g}", corners, _WALL_COLOUR, 0 if half > 0.0 else _UNSEEN
 
 
 def _containers(pipe: CrossPipe):
     """Yield (name, corners (k, 3) [m], colour, group) of the floors, and of the left and right outer ends."""
-    at = pipe.containers()
+    places = pipe.containers()
     # Half the width of a side's floor. In a narrow pipe the wall itself is the floor.
     width = np.sqrt(max(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2, 0.0))
     for side in ("left", "right") if width > LEAST_WIDTH_M else ():
-        outwards, floor_z = np.sign(at[side][0]), at[side][2] - FLOOR_BELOW_M
+        outwards, floor_z = np.sign(places[side][0]), places[side][2] - FLOOR_BELOW_M
         for part, x, z in (
             ("floor", (pipe.radius_m + LEDGE_M, pipe.branch_m), (floor_z - SHEET_M, floor_z)),
             ("end", (pipe.branch_m, pipe.branch_m + SHEET_M), (floor_z - SHEET_M, floor_z + END_HEIGHT_M)),
         ):
             corners = [[outwards * a, b, c] for a, b, c in itertools.product(x, (-width, width), z)]
             yield f"{CONTAINER}_{side}_{part}", np.array(corners), _CONTAINER_COLOURS[side], 0
-    rim = rim_points(pipe.radius_m, N_PLANKS) + at["bottom"] - [0.0, 0.0, FLOOR_BELOW_M]
+    rim = rim_points(pipe.radius_m, N_PLANKS) + places["bottom"] - [0.0, 0.0, FLOOR_BELOW_M]
     plate = np.concatenate([rim, rim - [0.0, 0.0, SHEET_M]])
     yield f"{CONTAINER}_bottom_floor", plate, _CONTAINER_COLOURS["bottom"], 0
 

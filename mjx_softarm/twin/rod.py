@@ -30,6 +30,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from mjx_softarm.sensing.pose import rotation_about
+
 GRAVITY_M_S2 = 9.81
 N_STRAINS = 6  # strains of an element: curvature x, y, twist [1/m], shear x, y, extension
 REST_STRAIN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -224,12 +226,12 @@ class Rod:
         lever = np.cross(up, turn).reshape(n * N_STRAINS, 3)
         matrix = (lever @ fall.reshape(-1, 3).T).reshape(n, N_STRAINS, n, N_STRAINS)
         matrix *= np.triu(np.ones((n, n)))[:, None, :, None]
-        # Make the matrix symmetric, and add the elements' own stiffness.
-        own = np.arange(n)
-        matrix[own, :, own] *= 0.5
+        # Make the matrix symmetric, and add the elements' diagonal stiffness.
+        diagonal = np.arange(n)
+        matrix[diagonal, :, diagonal] *= 0.5
         matrix = matrix.reshape(n * N_STRAINS, -1)
         matrix = (matrix + matrix.T).reshape(n, N_STRAINS, n, N_STRAINS)
-        matrix[own, :, own] += local
+        matrix[diagonal, :, diagonal] += local
         return gradient + fall @ up, matrix.reshape(n * N_STRAINS, -1)
 
     def _weights(self) -> tuple[np.ndarray, np.ndarray]:
@@ -260,15 +262,6 @@ class Rod:
 def _cross_matrix(v: np.ndarray) -> np.ndarray:
     """Return matrices (..., 3, 3) that multiply from the left as the cross product with v (..., 3)."""
     return (v @ _CROSS).reshape(*v.shape, 3)
-
-
-def rotation_about(v: np.ndarray) -> np.ndarray:
-    """Return rotations (..., 3, 3) about vectors (..., 3) by their lengths [rad]."""
-    angle = np.linalg.norm(v, axis=-1)[..., None, None]
-    cross = _cross_matrix(v)
-    return (
-        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
-    )
 
 
 def _left_jacobian(v: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ def test_errors_as_at_the_calibration_are_the_models():
     found = split(Planted(off_mm=np.array([0.3, 0.0, 0.4])))
     assert not found.shift_mm.any() and found.parts_mm["rest"] == pytest.approx(0.0, abs=0.03)
     assert found.parts_mm["S2R"] / found.parts_mm["estimator"] == pytest.approx(16 / 9)
-    assert found.largest == "S2R" and "record the poses of `calib plan`" in found.lines()[1]
+    assert found.largest == "S2R" and "record more random poses" in found.lines()[1]
 
 
 def test_errors_with_a_payload_are_no_shift_of_the_zeros():

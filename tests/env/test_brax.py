@@ -1,4 +1,4 @@
-"""brax's wrappers and brax's own agent on the environment, as they are."""
+"""brax's registry, wrappers and own agent on the environment, as they are."""
 
 import functools
 import warnings
@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs import training
+from brax import envs
+from brax.training.agents.ars import train as ars
 from brax.training.agents.sac import networks, train
 
+from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from tests.train.small import SHORT
 
@@ -24,14 +26,41 @@ def env():
     return ReachEnv(SHORT, EnvConfig(n_poses=64))
 
 
-def test_brax_s_wrappers_keep_the_state_s_types(env):
-    wrapped = training.EvalWrapper(training.wrap(env, episode_length=EPISODE_LENGTH))
-    keys = jax.random.split(jax.random.PRNGKey(0), N_ARMS)  # brax's keys are of the old kind
-    before = jax.eval_shape(wrapped.reset, keys)
-    after = jax.eval_shape(wrapped.step, before, jnp.zeros((N_ARMS, env.action_size)))
-    assert after.obs.shape == (N_ARMS, env.observation_size)
-    described = [jax.tree.map(lambda x: (x.shape, x.dtype), state) for state in (before, after)]
+def test_brax_s_wrappers_step_the_arm(env):
+    """brax finds the environment, and its wrappers step it, count its episodes and begin new ones."""
+    assert isinstance(env, envs.Env) and env.backend == "mjx"
+    config = {"spec": SHORT, "config": env.config}
+    wrapped = envs.create("soft_arm", episode_length=EPISODE_LENGTH, batch_size=N_ARMS, **config)
+    step = xla.jit(wrapped.step)
+    first = state = xla.jit(wrapped.reset)(jax.random.PRNGKey(0))  # brax's keys are of the old kind
+    for _ in range(EPISODE_LENGTH):
+        state = step(state, jnp.zeros((N_ARMS, env.action_size)))
+    assert isinstance(state, envs.State) and state.obs.shape == (N_ARMS, env.observation_size)
+    described = [jax.tree.map(lambda x: (x.shape, x.dtype), one) for one in (first, state)]
     assert described[0] == described[1]
+    # All went to the middle of their springs' range, so all poses are one, and each episode is over: brax has
+    # put the first state in the place of the last one, whose reward stays.
+    np.testing.assert_array_equal(state.done, 1.0)
+    np.testing.assert_array_equal(state.obs, first.obs)
+    assert (np.asarray(state.metrics["tip_error_mm"]) > 0).all() and (np.asarray(state.reward) != 0).all()
+
+
+def test_brax_s_ars_trains():
+    """Augmented random search on the closed form: brax compiles MJX for minutes on a CPU."""
+    env = ReachEnv(SHORT, EnvConfig(engine="chain", n_poses=64))
+    make_policy, params, metrics = ars.train(
+        env,
+        num_timesteps=64,
+        episode_length=EPISODE_LENGTH,
+        number_of_directions=4,
+        top_directions=2,
+        num_eval_envs=N_ARMS,
+        seed=1,
+    )
+    assert metrics["eval/avg_episode_length"] == EPISODE_LENGTH and metrics["eval/episode_unsettled"] == 0
+    assert metrics["training/params_norm"] > 0.0  # it begins at zero
+    action, _ = make_policy(params)(jnp.zeros(env.observation_size), jax.random.PRNGKey(0))
+    assert action.shape == (3,) and np.isfinite(action).all()
 
 
 def test_brax_s_sac_trains(env):

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.env.gym import ENV_ID, EPISODE_LENGTH, SoftArmEnv, SoftArmVectorEnv, as_sb3
 
-CONFIG = EnvConfig(n_poses=64)
+CONFIG = EnvConfig(engine="chain", n_poses=64)
 N_ARMS, LIMIT = 6, 3
 
 
@@ -54,7 +54,9 @@ def test_make_adds_the_time_limit_and_the_passive_checks(arm):
 
 
 def test_the_space_has_what_is_observed():
-    config = EnvConfig(n_poses=4, observation="payload", randomisation=Randomisation(payload_max_kg=1.0))
+    config = EnvConfig(
+        engine="chain", n_poses=4, observation="payload", randomisation=Randomisation(payload_max_kg=1.0)
+    )
     env = SoftArmEnv(config=config)
     obs, _ = env.reset(seed=0)
     assert obs.shape == (19,) and env.observation_space.contains(obs)

@@ -21,7 +21,9 @@ SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_sec
 
 def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_same():
     """A network that looks at a spring: poses of reset, step, pool and reward are corrected, and the body."""
-    config = EnvConfig(n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0), pipe_diameter_mm=300.0)
+    config = EnvConfig(
+        engine="chain", n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0), pipe_diameter_mm=300.0
+    )
     n_springs = SHORT_ARM.n_chambers
     weight = np.zeros((9 + n_springs, 6), np.float32)
     weight[9, 0] = 30.0  # mm for half the range of the first spring

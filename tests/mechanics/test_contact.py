@@ -24,14 +24,13 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.motion import midpoint
 from mjx_softarm.mechanics.motion.state import Motion, MotionParams, MovingArm
-from mjx_softarm.mechanics.newton import MAX_ITERATIONS_IN_CONTACT
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.pipe import Contact, CrossPipe, clearance, lip_distance
-from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, SettleResult, settle
+from mjx_softarm.mechanics.pipe import Contact, CrossPipe, clearance
+from mjx_softarm.mechanics.settle import MAX_ITERATIONS_IN_CONTACT, RESIDUAL_TOLERANCE, SettleResult, settle
 from mjx_softarm.mechanics.statics import statics
 
 SPEC = ArmSpec.default()
-PIPE = CrossPipe.of_mm(250.0, lip_mm=80.0)
+PIPE = CrossPipe.of_mm(250.0)
 CONTACT = Contact.of(PIPE, SPEC)
 R, Z = PIPE.radius_m, PIPE.centre_z_m
 N = 128
@@ -57,7 +56,7 @@ def settled():
     def one(reference):
         params = params_of()
         kinematics = chain_kinematics(params)
-        found = settle(kinematics, params, reference)
+        found = settle(params, reference)
         return found, ball_forces(CONTACT, kinematics(found.q))
 
     return jax.tree.map(np.asarray, xla.jit(jax.vmap(one))(np.float32(references())))
@@ -66,14 +65,10 @@ def settled():
 def energy(q):
     """Energy of the contact by its definition: the integral of each ball's force over its depth."""
     centre = ball_centres(CONTACT, chain_kinematics(params_of(np.float64))(q))
-    radius = jnp.array(CONTACT.radius_m)
-    to_lip = lip_distance(PIPE, jnp.moveaxis(centre, 0, -1))
-    total = 0.0
-    for distance in (pipe_distance(PIPE, centre), to_lip):
-        depth = jnp.maximum(radius - distance, 0.0)
-        ramp = jnp.minimum(depth, RAMP_M)
-        total += jnp.sum(ramp**3 / (6 * RAMP_M) + (depth - ramp) * (depth + ramp - RAMP_M) / 2)
-    return STIFFNESS_N_PER_M * total
+    depth = jnp.maximum(jnp.array(CONTACT.radius_m) - pipe_distance(PIPE, centre), 0.0)
+    ramp = jnp.minimum(depth, RAMP_M)
+    beyond = (depth - ramp) * (depth + ramp - RAMP_M) / 2
+    return STIFFNESS_N_PER_M * jnp.sum(ramp**3 / (6 * RAMP_M) + beyond)
 
 
 def test_the_distance_to_the_wall_is_that_to_its_nearest_point():
@@ -82,10 +77,9 @@ def test_the_distance_to_the_wall_is_that_to_its_nearest_point():
     across, y = R * np.cos(angle), R * np.sin(angle)
     both = [np.stack(at, -1).reshape(-1, 3) for at in ((across, y, along), (along, y, across))]
     wall = np.concatenate(both) + [0.0, 0.0, Z]
-    smooth = CrossPipe.of_mm(250.0)
     point = [0.0, 0.0, Z] + np.random.default_rng(0).uniform(-0.17, 0.17, (3000, 3))
-    point = point[clearance(smooth, point) > 0.02]
-    expected, _ = cKDTree(wall[clearance(smooth, wall) < 1e-9]).query(point)
+    point = point[clearance(PIPE, point) > 0.02]
+    expected, _ = cKDTree(wall[clearance(PIPE, wall) < 1e-9]).query(point)
     off = np.abs(pipe_distance(PIPE, jnp.array(point.T)) - expected)[expected < 0.075]  # rings: 69 mm
     assert len(off) > 500 and np.quantile(off, 0.97) < 2e-3 and off.max() < 5e-3
 
@@ -165,7 +159,7 @@ def test_the_wall_holds_the_arm():
 
     def free(reference):
         params = params_of(contact=None)
-        return settle(chain_kinematics(params), params, reference).q
+        return settle(params, reference).q
 
     outside_m = jax.jit(jax.vmap(lambda r: depth_m(free(r))))(np.float32(references()))
     inside_m = np.asarray(jax.jit(jax.vmap(depth_m))(found.q))
@@ -184,10 +178,9 @@ def test_the_implicit_derivative_is_along_central_differences():
 
     with jax.enable_x64(True):
         params = params_of(np.float64)
-        kinematics = chain_kinematics(params)
 
         def along(reference):
-            found = settle(kinematics, params, reference)
+            found = settle(params, reference)
             return jnp.sum(weight * found.tip_position_m), found
 
         gradient = jax.jit(jax.vmap(jax.grad(along, has_aux=True)))
@@ -218,7 +211,7 @@ def test_an_arm_in_motion_comes_to_rest_where_it_settles():
 
     def go(reference):
         arm = MovingArm(model, data, jax.tree.map(jnp.asarray, params), MotionParams())
-        begin = settle(chain_kinematics(params), params, params.spring_rest_m)
+        begin = settle(params, params.spring_rest_m)
         motion = Motion.at_rest(begin.q, begin.pressure_kpa, begin.spring_m)
         motion, end = midpoint.advance(arm, motion, reference, gains, 8.0, 0.02, 0.02)
         return end, jnp.linalg.norm(ball_forces(CONTACT, chain_kinematics(params)(motion.q)), axis=0).sum()

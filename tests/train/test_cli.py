@@ -196,10 +196,6 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
             "--resume absent: got --out, --learner, --seed too, expected none: its own settings hold",
         ),
         (["reach", "--env.workspace-seed", "20000"], "20000 draws the goals of the evaluation"),
-        (
-            ["reach", "--learner.from-policy"],
-            "learner.from_policy: got true, expected it only with --agent RUN",
-        ),
         (["evaluate", "absent", "--payload", "-1"], "--payload: got -1, expected a finite number >= 0"),
         (["evaluate", "absent", "--actions", "3"], "--actions: got 3 without --in-motion, expected"),
     ],

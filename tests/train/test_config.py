@@ -14,11 +14,11 @@ from train.presets import IMITATION_PRESETS, PRESETS
 
 def test_overrides_reach_every_level_and_leave_the_preset_alone():
     before = PRESETS["quick"]
-    after = override(before, ["seed=3", "learner.gamma=0.25", "learner.hidden=[64, 32]", "env.engine=mjx"])
+    after = override(before, ["seed=3", "learner.gamma=0.25", "learner.hidden=[64, 32]", "env.engine=chain"])
     got = (after.seed, after.learner.gamma, after.learner.hidden, after.env.engine)
     assert got == (3, 0.25, (64, 32), "mjx")
     assert override(after, ["env.reward.threshold=1"]).env.reward.threshold == 1.0
-    assert before.seed == 0 and before.env.engine == "chain"
+    assert before.seed == 0 and before.env.engine == "mjx"
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
         ("learner.n_arms=0", "learner.n_arms: got 0, expected at least 1"),
         ("learner.gamma=2", "learner.gamma: got 2.0, expected a number in [0, 1]"),
         ("learner.updates_per_env_step=0.001", "at least one update per step of all"),
-        ("learner.hindsight.near_min_mm=0", "learner.hindsight.near_min_mm: got 0.0"),
+        ("learner.hindsight.near_share=2", "learner.hindsight.near_share"),
         ("learner.replay_capacity=10", "learner.replay_capacity: got 10, expected at least n_arms = 128"),
     ],
 )
@@ -47,17 +47,21 @@ def test_a_payload_that_is_observed_is_up_to_the_arm_s_largest():
             override(PRESETS["payload"], [f"env.randomisation.payload_max_kg={given}"])
 
 
-def test_demonstrations_know_no_payload():
-    assert override(PRESETS["quick"], ["env.observation=payload"]).env.observation == "payload"
-    with pytest.raises(ConfigError, match="env.observation: got 'payload', expected 'pose' or 'motion'"):
-        override(IMITATION_PRESETS["pipe"], ["env.observation=payload"])
+@pytest.mark.parametrize(
+    "setting, message",
+    [
+        ("env.observation=payload", "env.observation: got payload, expected 'pose'"),
+        ("env.mode=dynamic", "env.mode: got dynamic, expected 'quasistatic'"),
+    ],
+)
+def test_demonstrations_are_of_arms_at_rest_and_know_no_payload(setting, message):
+    with pytest.raises(ConfigError, match=message):
+        override(IMITATION_PRESETS["pipe"], [setting])
 
 
-@pytest.mark.parametrize("preset, keeps", [("motion", True), ("quick", False), ("motion-analytic", False)])
-def test_tqc_in_motion_keeps_to_the_policy_that_it_begins_with(preset, keeps):
+def test_a_run_has_the_hidden_layers_of_the_policy_that_it_begins_with():
     donor = override(PRESETS["analytic"], ["learner.hidden=[32]"])
-    learner = PRESETS[preset].with_policy_of(donor).learner
-    assert learner.hidden == (32,) and getattr(learner, "from_policy", False) == keeps
+    assert PRESETS["motion-analytic"].with_policy_of(donor).learner.hidden == (32,)
 
 
 @pytest.mark.parametrize("config", [*PRESETS.values(), *IMITATION_PRESETS.values()])

@@ -38,10 +38,12 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv, choose_arms, over_arms
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_settings
+from train.agent.learner import Learner, LearnerConfig, Sample, check_settings
 from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
 
 Params = Any  # a flax parameter tree
+MAX_GRADIENT_NORM = 1.0  # a longer gradient is shortened to this
+NEW_SHARE = 0.33  # share of the arms that get a new start and goal after each step
 EARLY = 0.2  # weight of the mean cost of all actions beside that of the last: the tip shall arrive soon
 
 
@@ -49,8 +51,7 @@ EARLY = 0.2  # weight of the mean cost of all actions beside that of the last: t
 class AnalyticConfig(LearnerConfig):
     """Hyperparameters of learning through the simulation. Raises ValueError naming a bad field."""
 
-    VARIABLE = ("learning_rate", "learning_rate_half", "max_gradient_norm", "mean_share", "new_share")
-    VARIABLE += ("saturation_cost_per_mm",)
+    VARIABLE = ("learning_rate", "learning_rate_half", "mean_share", "saturation_cost_per_mm")
 
     hidden: tuple[int, ...] = (256, 256, 256, 256)  # widths of the policy's hidden layers
     activation: Activation = "swish"  # function after each of them
@@ -59,9 +60,7 @@ class AnalyticConfig(LearnerConfig):
     vector_steps_per_epoch: int = 256  # gradient steps between two reports
     learning_rate: float = 2e-3  # learning rate at first (Adam)
     learning_rate_half: float = 3_000.0  # gradient steps t_half of the rate's decay, 1 / (1 + t / t_half)
-    max_gradient_norm: float = 1.0  # a longer gradient is shortened to this
     mean_share: float = 0.1  # share of the gradient steps so far over which the mean policy averages
-    new_share: float = 0.33  # share of the arms that get a new start and goal after each step
     saturation_cost_per_mm: float = 0.1  # c of the loss
     horizon: int = 1  # actions that a gradient step looks ahead; more than one for arms in motion
 
@@ -70,9 +69,7 @@ class AnalyticConfig(LearnerConfig):
         required = {
             "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
             "learning_rate_half": (self.learning_rate_half > 0.0, "a number > 0"),
-            "max_gradient_norm": (self.max_gradient_norm > 0.0, "a number > 0"),
             "mean_share": (0.0 <= self.mean_share <= 1.0, "a number in [0, 1]"),
-            "new_share": (0.0 <= self.new_share <= 1.0, "a number in [0, 1]"),
             "saturation_cost_per_mm": (self.saturation_cost_per_mm >= 0.0, "a number >= 0"),
             "horizon": (self.horizon >= 1, "a whole number >= 1"),
         }
@@ -80,8 +77,9 @@ class AnalyticConfig(LearnerConfig):
 
     def check(self, env: EnvConfig) -> None:
         """Raise ValueError for MJX's own time step in motion: its gradient is neither tested nor cheap."""
-        usable = env.engine == "chain" or not env.moves
-        check_settings("env", env, {"engine": (usable, "'chain' in motion, for the gradient")})
+        engine = "mjx" if env.moves else "chain"
+        usable = env.engine == engine
+        check_settings("env", env, {"engine": (usable, f"{engine!r}, whose gradient this learner takes")})
 
 
 class AnalyticState(NamedTuple):
@@ -121,7 +119,7 @@ class Analytic(Learner):
         self.actor: Any = Actor(env.action_size, config.hidden, config.activation)
         self.arms = VectorEnv(env, config.n_arms, episode_length=1, mesh=mesh)
         self.optimizer = optax.chain(
-            optax.clip_by_global_norm(config.max_gradient_norm),
+            optax.clip_by_global_norm(MAX_GRADIENT_NORM),
             optax.adam(lambda n_steps: config.learning_rate / (1.0 + n_steps / config.learning_rate_half)),
         )
 
@@ -147,9 +145,9 @@ class Analytic(Learner):
         check_same_shapes("actor", params, state.actor_params)
         return state._replace(actor_params=params, mean_actor_params=own_buffers(params))
 
-    def act(self, state: AnalyticState, obs: Array, key: Array) -> Explored:
+    def act(self, state: AnalyticState, obs: Array, key: Array) -> Array:
         """Return the policy's actions (..., A) at obs (..., O): nothing needs to be explored."""
-        return Explored(self.mode(state.actor_params, obs))
+        return self.mode(state.actor_params, obs)
 
     def policy(self, state: AnalyticState) -> Params:
         """Return the parameters of the mean policy."""
@@ -223,6 +221,6 @@ class Analytic(Learner):
     def _go_on(self, after: State, key: Array) -> State:
         """Return the arms, some of them with a new start and goal."""
         key_new, key_reset = jax.random.split(key)
-        new = draws.uniform(key_new, (self.arms.n,)) < self.config.new_share
+        new = draws.uniform(key_new, (self.arms.n,)) < NEW_SHARE
         new |= ~after.info["valid"]
         return choose_arms(new, self.arms.reset(key_reset), after)

@@ -23,19 +23,18 @@ from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from train.agent.learner import Experience, Transition, check_settings
 
+NEAR_MM = (1.0, 100.0)  # distances of near goals; a millimetre goes with a turn of a degree
+
 
 @dataclass(frozen=True)
 class HindsightConfig:
     """Shares of a batch that get another goal; the rest keeps its own."""
 
-    VARIABLE = ("reached_share", "near_share", "near_min_mm", "near_max_mm", "mm_per_deg")
+    VARIABLE = ("reached_share", "near_share")
 
     reached_share: float = 0.5  # share whose goal becomes the pose reached
     near_share: float = 0.0  # share whose goal becomes a pose near the one reached
     n_later: int = 0  # largest number of actions to a reached pose, and to half of the near ones
-    near_min_mm: float = 1.0  # smallest distance of a near goal
-    near_max_mm: float = 100.0  # largest distance of a near goal
-    mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
     exchange_actions: bool = True  # relabelled, a saturated action becomes the sensed one
     saturation_costs: bool = True  # also where the goal is the pose reached; in the paper that has its bonus
 
@@ -43,11 +42,8 @@ class HindsightConfig:
         total = self.reached_share + self.near_share
         required = {
             "reached_share": (self.reached_share >= 0 and total <= 1, "0 to 1 - near_share"),
-            "near_share": (self.near_share >= 0, "a number >= 0"),
+            "near_share": (0 <= self.near_share <= 1, "0 to 1"),
             "n_later": (self.n_later >= 0, "at least 0"),
-            "near_min_mm": (self.near_min_mm > 0, "a number > 0"),
-            "near_max_mm": (self.near_max_mm >= self.near_min_mm, "near_min_mm or more"),
-            "mm_per_deg": (self.mm_per_deg > 0, "a number > 0"),
         }
         check_settings("learner.hindsight", self, required)
 
@@ -85,7 +81,7 @@ def relabel(
         pose = batch.later_pose
         half = kind < config.reached_share + config.near_share / 2
         centre = jnp.where(half[:, None], pose, centre)
-    near_pose = centre + near_offsets(distance, direction, config).astype(centre.dtype)
+    near_pose = centre + near_offsets(distance, direction).astype(centre.dtype)
     goal = jnp.where(reached[:, None], pose, jnp.where(near[:, None], near_pose, batch.goal))
 
     # Actions: where a chamber saturated, the one that asks for the lengths it reached.
@@ -129,19 +125,16 @@ def _joined(observation: Array, sensed: Array | None) -> Array:
     return observation if sensed is None else jnp.concatenate([observation, sensed], axis=-1)
 
 
-def near_offsets(distance: Array, direction: Array, config: HindsightConfig) -> Array:
+def near_offsets(distance: Array, direction: Array) -> Array:
     """Return offsets (n, 6) [mm, deg]: random directions, log-uniform lengths, and turns.
 
     Args:
         distance (n,): uniform draws in [0, 1).
         direction (n, 6): normal draws.
-        config: the least and the largest length.
 
     A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
     tail: some goals are turned further than the arm can turn, as a user's goals may be.
     """
-    low, high = jnp.log(config.near_min_mm), jnp.log(config.near_max_mm)
+    low, high = (jnp.log(limit_mm) for limit_mm in NEAR_MM)
     length = jnp.exp(low + (high - low) * distance)[:, None]  # (n, 1) [mm]
-    direction = direction / jnp.linalg.norm(direction[:, :3], axis=-1, keepdims=True)  # (n, 6)
-    per_unit = jnp.array([1.0] * 3 + [1.0 / config.mm_per_deg] * 3)
-    return length * direction * per_unit
+    return length * (direction / jnp.linalg.norm(direction[:, :3], axis=-1, keepdims=True))

@@ -4,9 +4,6 @@ At rest an action leads to the same pose from every start. So a demonstrated act
 its goal from any start, and expert actions are stored with the agent's state: the discriminator compares two
 actions for one observation. The expert's answers also take a share of each batch of the critics.
 
-In motion an arm is still on its way when the next action comes. There a share of the arms' actions are the
-expert's answers to their goals, and the discriminator compares these with the agent's present actions.
-
 The learned reward is for goals that were asked for; the discriminator does not know relabelled goals. The
 reward is never positive, and an episode ends with the goal reached or by the clock, so delay earns nothing.
 
@@ -28,11 +25,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.mdp import observation, rewards
+from mjx_softarm.mdp import rewards
 from train.agent.gail import DiscriminatorState, Gail, GailConfig
-from train.agent.learner import Experience, Explored, Learner, Sample, Transition, check_settings
+from train.agent.learner import Experience, Learner, Sample, Transition, check_settings
 from train.agent.networks import check_same_shapes
 from train.agent.stages import STAGES_OPTION, GoalStage
 from train.agent.tqc import HindsightTQC, TQCConfig
@@ -54,7 +50,7 @@ class ImitationConfig(TQCConfig):
     frozen: bool = False
     """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
     expert_share: float = 0.25
-    """share of the critics' batches that is the expert's; in motion, share of the arms' actions"""
+    """share of the critics' batches that is the expert's"""
     expert_start: ExpertStart = "agent"
     """state at which the discriminator sees the expert's action: the agent's; or, as in the paper, the pose
     shown before"""
@@ -86,14 +82,14 @@ class ImitationConfig(TQCConfig):
     def check(self, env: EnvConfig) -> None:
         """Raise ValueError for an environment that does not suit demonstrations.
 
-        A demonstrated action is right for one payload. A pose that was shown is no state in motion.
+        A demonstrated action leads to one pose from every start, at rest and with one payload alone.
         """
         super().check(env)
-        start = self.expert_start == "agent" or not env.moves
-        check_settings("learner", self, {"expert_start": (start, "'agent' in motion")})
-        if env.observation == "payload":
-            expected = "'pose' or 'motion' for demonstrations"
-            raise ValueError(f"env.observation: got 'payload', expected {expected}")
+        required = {
+            "mode": (not env.moves, "'quasistatic' for demonstrations"),
+            "observation": (env.observation == "pose", "'pose' for demonstrations"),
+        }
+        check_settings("env", env, required)
 
     @property
     def stage_epochs(self) -> tuple[int, ...]:
@@ -128,8 +124,7 @@ class Imitation(Learner):
         self.actions = jnp.asarray(demonstrations.actions)  # (m, A)
         self.before = jnp.asarray(shown_before(demonstrations.sequence))  # (m,)
         self.gail = Gail(env.observation_size, env.action_size, config.gail)
-        at_rest = not env.config.moves
-        self.n_expert = round(at_rest * config.expert_share * config.batch_size)  # rows of a batch
+        self.n_expert = round(config.expert_share * config.batch_size)  # rows of a batch
         self.mode = self.learner.mode
 
     def init(self, key: Array) -> ImitationState:
@@ -138,16 +133,9 @@ class Imitation(Learner):
         discriminator = self.gail.init(key_discriminator) if self.config.learned_weight else None
         return ImitationState(self.learner.init(key_agent), discriminator)
 
-    def act(self, state: ImitationState, obs: Array, key: Array) -> Explored:
-        """Return the wrapped learner's exploring actions; in motion, some are the expert's."""
-        own = self.learner.act(state.agent, obs, key)
-        if not self.env.config.moves:
-            return own
-        scale = self.env.scale
-        goal = obs[..., observation.GOAL] * scale.scale + scale.centre
-        by_expert = draws.uniform(jax.random.fold_in(key, 1), obs.shape[:-1]) < self.config.expert_share
-        expert = self.actions[self._index_of(goal)]
-        return Explored(jnp.where(by_expert[..., None], expert, own.action), by_expert)
+    def act(self, state: ImitationState, obs: Array, key: Array) -> Array:
+        """Return the wrapped learner's exploring actions."""
+        return self.learner.act(state.agent, obs, key)
 
     def policy(self, state: ImitationState) -> Any:
         """Return the wrapped learner's policy."""
@@ -160,13 +148,12 @@ class Imitation(Learner):
         key_sample, key_between, key_relabel, key_update = jax.random.split(key, 4)
         discriminator, metrics = state.discriminator, {}
 
-        # Batch: stored transitions, relabelled; at rest the first rows are exchanged for the expert's.
+        # Batch: stored transitions, relabelled; the first rows are exchanged for the expert's.
         stored = sample(key_sample, self.config.hindsight.n_later)
         index = self._index_of(stored.goal)  # (B,)
         batch, relabelled = self.learner.transitions(stored, key_relabel)
-        if not self.env.config.moves:
-            batch = self.with_expert(batch, stored, index)
-            relabelled = relabelled.at[: self.n_expert].set(False)
+        batch = self.with_expert(batch, stored, index)
+        relabelled = relabelled.at[: self.n_expert].set(False)
 
         # Discriminator: the expert's actions against the agent's, at one observation or as in the paper.
         if self.config.expert_start == "shown":
@@ -174,9 +161,8 @@ class Imitation(Learner):
             pairs = (start, self.actions[index]), (batch.obs, batch.action)
             relabelled = jnp.zeros_like(relabelled)  # their goals are known to the discriminator
         else:
-            start = self.env.observe(stored.pose, stored.goal, stored.sensed)  # (B, O)
-            agent = self.of_agent(state, stored, start, key_between)  # (B, A)
-            pairs = (start, self.actions[index]), (start, agent)
+            start = self.env.observe(stored.pose, stored.goal)  # (B, O)
+            pairs = (start, self.actions[index]), (start, stored.action)
         if discriminator is not None and not self.config.frozen:
             discriminator, metrics = self.gail.update(discriminator, *pairs, key_between)
 
@@ -231,20 +217,6 @@ class Imitation(Learner):
         learned = jnp.where(relabelled, 0.0, learned)
         mean = jnp.sum(learned) / jnp.maximum(jnp.sum(~relabelled), 1)
         return reward + self.config.learned_weight * learned, {"reward": mean}
-
-    def of_agent(self, state: ImitationState, stored: Experience, start: Array, key: Array) -> Array:
-        """Return the actions (B, A) of B transitions, the agent's present ones where the expert acted.
-
-        Args:
-            state: state of this learner.
-            stored: B transitions.
-            start (B, O): their observations.
-            key: draws the agent's present actions.
-        """
-        if stored.by_expert is None:
-            return stored.action
-        own = self.learner.act(state.agent, start, jax.random.fold_in(key, 1)).action  # (B, A)
-        return jnp.where(stored.by_expert[:, None], own, stored.action)
 
     def with_expert(self, batch: Transition, stored: Experience, index: Array) -> Transition:
         """Return a batch whose first rows are the expert's answers, from the same starts to the same goals.

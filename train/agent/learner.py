@@ -129,7 +129,6 @@ class Experience(NamedTuple):
     n_steps: Array  # (...,) actions taken in the episode, this one included
     sensed: Array | None = None  # (..., k) observation without pose and goal; None where it has nothing else
     next_sensed: Array | None = None  # (..., k) the same after the action
-    by_expert: Array | None = None  # (...,) bool: the action is a demonstrated one; None where none can be
     later_pose: Array | None = None  # (..., 6) [mm, deg] after a later action of the episode; never stored
 
 
@@ -152,13 +151,6 @@ class Transition(NamedTuple):
                 raise ValueError(f"Transition.{name}: got shape {value.shape}, expected {expected}")
 
 
-class Explored(NamedTuple):
-    """Actions that explore."""
-
-    action: Array  # (..., A) in [-1, 1]
-    by_expert: Array | None = None  # (...,) bool: demonstrated actions; None where no action can be one
-
-
 class Sample(Protocol):
     """Batches of the replay, drawn uniformly with replacement."""
 
@@ -176,7 +168,7 @@ class Learner(Protocol):
         """Return the first state; no two of its leaves share a buffer, since the state is donated."""
         ...
 
-    def act(self, state: Any, obs: Array, key: Array) -> Explored:
+    def act(self, state: Any, obs: Array, key: Array) -> Array:
         """Return exploring actions (..., A) in [-1, 1] at observations (..., O)."""
         ...
 

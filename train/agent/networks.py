@@ -12,7 +12,6 @@ from mjx_softarm.mdp.observation import OBS_SIZE
 
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
-GIVEN_LOG_STD = -4.0  # initial exploration noise of a given actor: log standard deviation before tanh
 COST_AHEAD = 40.0  # initial weight of a predicted error of 1, summed over the predictions
 
 
@@ -66,15 +65,6 @@ def descend(
 def own_buffers(tree: Any) -> Any:
     """Return a copy of a tree of arrays, so that a state that has both can be donated."""
     return jax.tree.map(jnp.copy, tree)
-
-
-def given_actor(params: Any, obs_size: int, action_size: int) -> Any:
-    """Return an actor that takes (..., O), with the means of a given one and little noise."""
-    params = widened(params, obs_size)
-    head = params["params"]["head"]
-    head["kernel"] = head["kernel"].at[:, action_size:].set(0.0)
-    head["bias"] = head["bias"].at[action_size:].set(GIVEN_LOG_STD)
-    return params
 
 
 def check_same_shapes(name: str, given: Any, own: Any) -> None:

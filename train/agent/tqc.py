@@ -20,11 +20,10 @@ from jax import Array
 
 from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
-from train.agent import networks, prior
+from train.agent import networks
 from train.agent.hindsight import HindsightConfig, relabel
 from train.agent.learner import (
     Experience,
-    Explored,
     Learner,
     ReplayConfig,
     Sample,
@@ -57,7 +56,6 @@ class TQCConfig(ReplayConfig):
     tau: float = 0.005  # Polyak rate of the target critics and of the mean actor, per update
     initial_alpha: float = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
-    from_policy: bool = False  # whether a run in motion begins with a policy and keeps to it; see `prior`
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
     hindsight: HindsightConfig = field(default_factory=HindsightConfig)
     """relabelled goals, as shares of a batch; the rest keeps its own goals"""
@@ -95,7 +93,6 @@ class TQCState(NamedTuple):
     actor_opt_state: optax.OptState
     critic_opt_state: optax.OptState
     alpha_opt_state: optax.OptState
-    given_params: Params | None = None  # actor that the run began with; None where it has no hold
 
 
 # Fields of the state by the names of the parts that another run may begin with, beside the policy.
@@ -117,11 +114,8 @@ class TQC:
         rate, end = config.learning_rate, config.learning_rate_end
         if end != 1.0:  # a half cosine over the run
             rate = optax.cosine_decay_schedule(rate, config.n_decay_updates, end)
-        self.optimizer = self.actor_optimizer = optax.adam(rate)
+        self.optimizer = optax.adam(rate)
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
-        if config.from_policy:
-            self.actor_optimizer = optax.adam(prior.held_back(rate, prior.RATE_SHARE))
-            self.alpha_optimizer = optax.adam(prior.held_back(config.learning_rate_alpha))
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
     def init(self, key: Array) -> TQCState:
@@ -137,10 +131,9 @@ class TQC:
             critic_params=critic_params,
             target_params=networks.own_buffers(critic_params),
             log_alpha=log_alpha,
-            actor_opt_state=self.actor_optimizer.init(actor_params),
+            actor_opt_state=self.optimizer.init(actor_params),
             critic_opt_state=self.optimizer.init(critic_params),
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
-            given_params=networks.own_buffers(actor_params) if self.config.from_policy else None,
         )
 
     def parts(self, state: TQCState) -> dict[str, Params]:
@@ -154,15 +147,6 @@ class TQC:
         given = {"mean_actor_params": parts["policy"], **{f: parts[n] for n, f in _PARTS.items()}}
         networks.check_same_shapes("networks", given, {name: getattr(state, name) for name in given})
         return state._replace(**given)
-
-    def adopt_policy(self, state: TQCState, given: Params) -> TQCState:
-        """Return the state with a given actor's means and little exploration; it may observe less."""
-        actor = networks.given_actor(given, self.obs_size, self.action_size)
-        networks.check_same_shapes("actor", actor, state.actor_params)
-        given = networks.own_buffers(actor) if self.config.from_policy else None
-        return state._replace(
-            actor_params=actor, mean_actor_params=networks.own_buffers(actor), given_params=given
-        )
 
     def act(self, state: TQCState, obs: Array, key: Array) -> Array:
         """Sample an action (..., A) in (-1, 1) at obs (..., O)."""
@@ -202,7 +186,7 @@ class TQC:
 
         # Optimiser steps, and Polyak averages of their results.
         critic = networks.descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
-        actor = networks.descend(self.actor_optimizer, d_actor, state.actor_opt_state, state.actor_params)
+        actor = networks.descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
         temperature = networks.descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
         next_state = state._replace(
             actor_params=actor[0],
@@ -243,12 +227,7 @@ class TQC:
     def _actor_loss(self, params: Params, state: TQCState, obs: Array, noise: Array) -> tuple[Array, Array]:
         action, log_prob = networks.squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
         quantiles = self.critics.apply(state.critic_params, obs, action)  # (B, C, M)
-        loss = actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha))
-        if state.given_params is not None:
-            actions = self.mode(params, obs), self.mode(state.given_params, obs)
-            n_updates = state.critic_opt_state[0].count  # type: ignore
-            loss += prior.departure_cost(obs, *actions, n_updates / self.config.n_decay_updates)
-        return loss, log_prob
+        return actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha)), log_prob
 
 
 class HindsightTQC(Learner):
@@ -257,24 +236,8 @@ class HindsightTQC(Learner):
     def __init__(self, config: TQCConfig, env: ReachEnv):
         self.config, self.env = config, env
         self.tqc = tqc = TQC(env.observation_size, env.action_size, config)
-        self.init, self.policy, self.mode, self.parts = tqc.init, tqc.policy, tqc.mode, tqc.parts
-
-    def act(self, state: TQCState, obs: Array, key: Array) -> Explored:
-        """Sample actions (..., A) in (-1, 1) at obs (..., O)."""
-        return Explored(self.tqc.act(state, obs, key))
-
-    def adopt(self, state: TQCState, parts: Mapping[str, Any]) -> TQCState:
-        """Return the state with another run's networks and temperature.
-
-        A run in motion takes the policy alone, of a run at rest or in motion and of any learner. Entries of
-        the observation that the other policy lacks have no weight at first, and the critics begin anew.
-
-        Raises:
-            ValueError: the other run has no such networks, or networks of another size.
-        """
-        if self.env.config.moves:
-            return self.tqc.adopt_policy(state, parts["policy"])
-        return self.tqc.adopt(state, parts)
+        self.init, self.act, self.policy, self.mode = tqc.init, tqc.act, tqc.policy, tqc.mode
+        self.parts, self.adopt = tqc.parts, tqc.adopt
 
     def update(self, state: TQCState, sample: Sample, key: Array) -> tuple[TQCState, dict[str, Array]]:
         """Take one gradient step of all networks on one relabelled batch."""

@@ -13,7 +13,7 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.pipe import CrossPipe, body_clearances
+from mjx_softarm.mechanics.pipe import CrossPipe, body_points, clearance
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
@@ -55,16 +55,15 @@ class PostureTarget(NamedTuple):
 def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
     """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        kinematics = chain_kinematics(params)
-        found = settle_pressures(kinematics, params.without_pressure_limits(), pressure_kpa)
-        frames = kinematics(found.q)
+        found = settle_pressures(params.without_pressure_limits(), pressure_kpa)
+        frames = chain_kinematics(params)(found.q)
         plates = frames.plate_position, frames.plate_rotation
         pose = pose_from_frame(frames.tip_position, frames.tip_rotation)
         if s2r is not None:
             pose = correct(s2r, pose, found.spring_m)
             plates = carry_body(*plates, pose)
         position_m, rotation = frame_from_pose(pose)
-    wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else body_clearances(pipe, *plates, spec)
+    wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else clearance(pipe, body_points(*plates, spec))
     return Posture(
         pressure_kpa=pressure_kpa,
         spring_m=found.spring_m,

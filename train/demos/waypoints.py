@@ -35,13 +35,7 @@ class Waypoint(NamedTuple):
 # Stops of a path, each with the number of moves to it; the path begins at "home".
 _PIPE300 = (("pick right", 4), ("place left", 7), ("pick bottom", 6), ("place right", 6), ("home", 4))
 _PIPE250 = (("pick left", 6), ("place bottom", 8), ("pick right", 8), ("place left", 8), ("home", 6))
-_STOPS = {
-    "pipe300": _PIPE300,
-    "pipe250": _PIPE250,
-    "pipe200": _PIPE250,
-    "lip300": _PIPE300,
-    "lip250": _PIPE250,
-}
+_STOPS = {"pipe300": _PIPE300, "pipe250": _PIPE250, "pipe200": _PIPE250}
 TASKS = ("circle16", *_STOPS)
 
 

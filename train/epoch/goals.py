@@ -2,14 +2,10 @@
 
 An episode goes from one position to another. Starts are all of them; goals of the first stage are some of
 them, those of later stages more. Between epochs, goals shift to the positions with the largest errors.
-
-An arm in motion needs more than a pose to begin with: it starts at rest under a demonstrated action. Half of
-the episodes start at the position that was shown before their goal, in the order of the demonstration.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -17,19 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_softarm._support import draws, xla
-from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import choose_arms
-from mjx_softarm.mechanics.workspace import Pool
 from train.agent.imitation import ImitationConfig
-from train.config import ConfigError
-from train.demos.demonstrations import Demonstrations, shown_before
+from train.demos.demonstrations import Demonstrations
 from train.epoch.job import Job
 from train.epoch.state import TrainState
 
 EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they are reached
-NEXT_SHARE = 0.5  # share of the episodes in motion that start at the position shown before their goal
 
 
 class DemonstratedGoals:
@@ -38,8 +30,6 @@ class DemonstratedGoals:
     def __init__(self, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations):
         self.config, self.env = config, env
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
-        self.before = jnp.asarray(shown_before(demonstrations.sequence))  # (m,)
-        self.static_poses = static_poses(env, demonstrations.actions) if env.config.moves else None
 
     def init(self) -> Array:
         """Return the weights of the first stage."""
@@ -51,15 +41,9 @@ class DemonstratedGoals:
         arm, n = arms.pipeline_state, len(arms.obs)
         start = jax.random.randint(key_start, (n,), 0, len(self.positions))
         goal = jax.random.categorical(key_goal, jnp.log(state), shape=(n,))
-        if self.static_poses is None:
-            fresh = arm._replace(pose=self.positions[start], goal=self.positions[goal])
-        else:
-            follows = draws.uniform(jax.random.fold_in(key_start, 1), (n,)) < NEXT_SHARE
-            start = jnp.where(follows, self.before[goal], start)
-            at_start = jax.tree.map(lambda x: x[start], self.static_poses)
-            fresh = jax.vmap(self.env.put)(arm, at_start)._replace(goal=self.positions[goal])
+        fresh = arm._replace(pose=self.positions[start], goal=self.positions[goal])
         arm = choose_arms(arm.n_steps == 0, fresh, arm)
-        return arms.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, arm.goal, arm.sensed))
+        return arms.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, arm.goal))
 
     def of_stage(self, epoch: int) -> np.ndarray:
         """Return which positions (m,) are goals in an epoch: bool."""
@@ -81,30 +65,6 @@ class DemonstratedGoals:
     def rebalance(self, state: TrainState, epoch: int, error_mm: Sequence[float] | np.ndarray) -> TrainState:
         """Return the state with goals shifted to the positions (m,) with the largest errors [mm]."""
         return state._replace(goals=jnp.asarray(goal_weights(error_mm, self.of_stage(epoch))))
-
-
-def static_poses(env: ReachEnv, actions: np.ndarray) -> Pool:
-    """Return the static poses of the nominal arm under actions (m, n_springs) in [-1, 1].
-
-    Raises:
-        ConfigError: the arm does not come to rest under one of them.
-    """
-    config = dataclasses.replace(
-        env.config,
-        engine="chain",
-        mode="quasistatic",
-        observation="pose",
-        n_poses=1,
-        randomisation=Randomisation(),
-    )
-    still = ReachEnv(env.spec, config, env.s2r)
-    begin = still.reset(jax.random.PRNGKey(0))
-    after = xla.jit(jax.vmap(still.step, in_axes=(None, 0)))(begin, jnp.asarray(actions))
-    if not after.info["valid"].all():
-        lost = ", ".join(map(str, np.flatnonzero(~after.info["valid"])))
-        raise ConfigError(f"demonstrations: got rows {lost}, at which the arm does not settle, expected none")
-    arm = after.pipeline_state
-    return Pool(arm.motion.q, arm.pressure_kpa, arm.spring_m, arm.pose)
 
 
 def goal_weights(error_mm: Sequence[float] | np.ndarray, goals: np.ndarray) -> np.ndarray:

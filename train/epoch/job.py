@@ -23,7 +23,7 @@ from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.mechanics.workspace import Pool
 from train.agent.hindsight import later_pose
-from train.agent.learner import Experience, Explored, Learner, LearnerConfig
+from train.agent.learner import Experience, Learner, LearnerConfig
 from train.epoch import replay
 from train.epoch.devices import everywhere, spread
 from train.epoch.state import TrainState, sharding_of
@@ -164,8 +164,8 @@ class Job:
         if not self.learner.own_arms:
             # Arms at their first starts, and an empty replay of the transitions that they will make.
             arms = self.goals.begin(goals, self.arms.reset(key_arms), key_goals)
-            explored = jax.eval_shape(self.learner.act, learner, arms.obs, key)
-            experience = jax.eval_shape(self._experience, arms, explored, arms)
+            action = jax.eval_shape(self.learner.act, learner, arms.obs, key)
+            experience = jax.eval_shape(self._experience, arms, action, arms)
             one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
             memory = replay.create(one, self.config.replay_capacity)
         return TrainState(arms, learner, memory, goals, key, n_epochs=jnp.zeros((), jnp.int32))
@@ -200,17 +200,14 @@ class Job:
         warmed_up = self._warmed_up(state.n_epochs, step)
         uniform = draws.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
         explored = self.learner.act(state.learner, state.arms.obs, key_act)
-        explored = Explored(
-            action=jnp.where(warmed_up, explored.action, uniform),  # (n_arms, n_springs)
-            by_expert=None if explored.by_expert is None else warmed_up & explored.by_expert,
-        )
+        action = jnp.where(warmed_up, explored, uniform)  # (n_arms, n_springs)
 
         # Step the arms; where an episode ended, begin the next one.
-        arms, after, outcome = self.arms.step(state.arms, explored.action, key_reset)
+        arms, after, outcome = self.arms.step(state.arms, action, key_reset)
         arms = self.goals.begin(state.goals, arms, key_goals)
 
         # Store what is valid and finite.
-        experience = self._experience(state.arms, explored, after)
+        experience = self._experience(state.arms, action, after)
         valid = outcome.valid & replay.finite_rows(experience)  # (n_arms,)
         memory = replay.add(state.memory, experience, valid)
         state = state._replace(arms=arms, memory=memory, key=key)
@@ -255,17 +252,17 @@ class Job:
         learner, metrics = jax.lax.cond(warmed_up, run, lambda learner: (learner, nothing), state.learner)
         return state._replace(learner=learner), metrics
 
-    def _experience(self, before: State, explored: Explored, after: State) -> Experience:
+    def _experience(self, before: State, action: Array, after: State) -> Experience:
         """Return the transitions of n arms as they are stored."""
         start, end = before.pipeline_state, after.pipeline_state
         sensed_action = self.env.action_of(end.spring_m + end.sensor_offset_m)
         if self.env.config.moves:  # the arm moves on: the other references still count
             blocked = control.blocked_springs(after.info["blocked"], self.env.gains)
-            sensed_action = jnp.where(blocked, sensed_action, explored.action)
+            sensed_action = jnp.where(blocked, sensed_action, action)
         return Experience(
             pose=start.pose,
             goal=start.goal,
-            action=explored.action,
+            action=action,
             next_pose=end.pose,
             sensed_action=sensed_action,
             saturated=after.info["saturated"],
@@ -273,7 +270,6 @@ class Job:
             n_steps=end.n_steps,
             sensed=start.sensed,
             next_sensed=end.sensed,
-            by_expert=explored.by_expert,
         )
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.export.write import export_cpp, export_onnx
@@ -28,7 +29,7 @@ from train.runs import run as runs
 from train.runs.arm_model import arm_model
 from train.runs.checkpoint import RunError
 from train.runs.evaluate import N_ACTIONS
-from train.runs.export import check_policy, export_run
+from train.runs.export import check_policy, export_run, export_weights
 from train.runs.folder import Run
 from train.runs.lock import sole_trainer
 from train.runs.renew import renewed, told_enough
@@ -46,8 +47,8 @@ class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""
 
     agent: cli.MaybePath = None
-    """run whose actor and critics this one begins with; in motion, only the policy, which TQC keeps to while
-    its critics learn. The widths of its hidden layers are taken, too"""
+    """run whose policy this one begins with, and whose critics if both learn by TQC. The widths of its hidden
+    layers are taken, too"""
     devices: Devices = None
 
     def __call__(self) -> int:
@@ -57,8 +58,6 @@ class Reach(ReachOptions):
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
         agent = Run.open(self.agent) if self.agent else None
-        if getattr(self.config.learner, "from_policy", False) and not (agent and self.config.env.moves):
-            raise ConfigError("learner.from_policy: got true, expected it only with --agent RUN, in motion")
         config = self.config.with_policy_of(agent.config) if agent else self.config
         arm = self.read_arm(console)
         console.print("drawing goals from the reachable workspace ...")
@@ -85,9 +84,8 @@ class Imitate(NewRunOptions):
     file: tyro.conf.Positional[cli.MaybePath] = None
     """demonstrations as `demos record` writes them"""
     preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
-    """settings to begin with. pipe: the learned reward; pipe-moving: the learned reward on arms in motion;
-    circle: the learned reward and the environment's, in two stages; paper-circle, paper-pipe: the paper's own
-    recipe"""
+    """settings to begin with. pipe: the learned reward; circle: the learned reward and the environment's, in
+    two stages; paper-circle, paper-pipe: the paper's own recipe"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""
@@ -163,6 +161,8 @@ def evaluate(
     n_actions = actions or N_ACTIONS
     console = start()
     opened = Run.open(run)
+    if in_motion is not None and opened.demonstrations():
+        raise ConfigError("--in-motion: got a run of `imitate`, expected one of `reach`")
     task, policy = runs.task_of_run(opened), opened.policy()
     if in_motion is None and not payload:
         _show(opened, task, runs.finish(opened, task, policy), console)
@@ -193,6 +193,7 @@ def export(
     onnx: bool = False,
     cpp: cli.MaybePath = None,
     calibration: cli.MaybePath = None,
+    weights: cli.MaybePath = None,
 ) -> int:
     """Write policies as npz files, and for other runtimes.
 
@@ -202,10 +203,20 @@ def export(
         cpp: folder for a C++ header, programs and golden rows, for one run
         calibration: later calibration of the same arm, whose models the policies get without training; None
             for the file means policy-NAME.npz after this folder. Exit status 1 if a policy needs training
+        weights: file for the actor alone, of one run; nothing is distilled, and nothing else written
     """
-    if not folders or ((out or cpp) and len(folders) > 1):
-        expected = "one folder of a run" + ("" if out or cpp else " or more")
+    if not folders or ((out or cpp or weights) and len(folders) > 1):
+        expected = "one folder of a run" + ("" if out or cpp or weights else " or more")
         raise RunError(f"RUN: got {len(folders)}, expected {expected}")
+    if weights:
+        if out or onnx or cpp or calibration:
+            raise InputError(
+                "--weights: got it with --out, --onnx, --cpp or --calibration, expected it alone"
+            )
+        (folder,) = folders
+        export_weights(Run.open(folder), weights)
+        print(f"weights: {weights}, {weights.stat().st_size / 1024:.0f} KiB")
+        return 0
     console, enough = start(), True
     for path in folders:
         run, file, keeps = Run.open(path), out, path

@@ -135,7 +135,7 @@ def fit_load_estimator(arm: CalibratedArm, loaded: LoadedPool, seed: int) -> Loa
     else:
         mean_kpa, share = residual(held, spring_m, light_kpa)
         covariance, left_kpa = held.covariance_kpa2, mean_kpa.reshape(light_kpa.shape)
-    held_at_kpa = light_kpa + left_kpa + spec.unmodelled_kpa(spring_m)
+    held_at_kpa = light_kpa + left_kpa + spec.unmodelled_kpa
     # Learn, and judge by poses that are not learned
     out = np.float32(np.concatenate([held_at_kpa, effect, np.log(share)], axis=1))
     parts = np.split(spring_m, [-N_JUDGING]), np.split(out, [-N_JUDGING])
@@ -202,7 +202,7 @@ def _held(
     kpa = light_kpa + effect_kpa
     if arm.held is not None:
         kpa = held_kpa(arm.held, spring_m, light_kpa, effect_kpa, rng)
-    return kpa + arm.spec.unmodelled_kpa(spring_m)
+    return kpa + arm.spec.unmodelled_kpa
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:

@@ -156,9 +156,15 @@ def start_keys(n_arms: int) -> Array:
 
 
 def nominal(env: ReachEnv) -> ReachEnv:
-    """Return the environment without randomisation; it draws from the same pool of poses."""
+    """Return the environment without randomisation; it draws from the same pool of poses.
+
+    At rest it is the closed form. MJX puts the tip within a micrometre of it, and takes ten seconds more to
+    compile.
+    """
     other = copy.copy(env)
-    other.config = dataclasses.replace(env.config, randomisation=Randomisation(payload_max_kg=0.0))
+    engine = env.config.engine if env.config.moves else "chain"
+    config = dataclasses.replace(env.config, engine=engine)
+    other.config = dataclasses.replace(config, randomisation=Randomisation(payload_max_kg=0.0))
     other.episode_motion = EpisodeMotion(env.spec, other.config)
     return other
 

@@ -202,12 +202,10 @@ def positions_figure(at: AtPositions) -> Figure:
     left.plot(pose[:, 0], pose[:, 2], "o", markersize=3.5, color=BLUE, label="reached")
     left.set_aspect("equal")
     left.legend(frameon=False, loc="upper right")
-    # Bars of all starts at one position stand in front of each other, the shortest in front.
-    order = np.argsort(-error)
-    middle.bar(at.position[order], error[order], color=np.where(at.success, BLUE, ORANGE)[order])
+    position = np.arange(len(error))
+    middle.bar(position, error, color=np.where(at.success, BLUE, ORANGE))
     if np.isfinite(at.reached.clearance_mm).all():
-        order = np.argsort(-at.reached.clearance_mm)
-        right.bar(at.position[order], at.reached.clearance_mm[order], color=BLUE)
+        right.bar(position, at.reached.clearance_mm, color=BLUE)
     else:
         right.text(0.5, 0.5, "no pipe", ha="center", transform=right.transAxes, color=GREY)
     return figure

@@ -23,7 +23,7 @@ from train.epoch.job import Job
 from train.epoch.poses import Poses
 from train.epoch.state import TrainState
 from train.runs.evaluate import N_GOALS, Evaluator
-from train.runs.positions import N_STARTS, PositionEvaluator
+from train.runs.positions import PositionEvaluator
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,10 +103,9 @@ def _imitation(
             state = goals.begin_stage(job, state, epoch)
         return job.place(state)
 
-    starts = f" from {N_STARTS} starts" if env.config.moves else ""
     return Task(
         job=job,
-        title=f"{len(demonstrations.positions)} demonstrated positions{starts}",
+        title=f"{len(demonstrations.positions)} demonstrated positions",
         evaluate=evaluate,
         pictures=lambda *found: plots.imitation_pictures(*found),
         headline=lambda row: (

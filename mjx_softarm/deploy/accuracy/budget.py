@@ -101,10 +101,10 @@ def _remedies(found: Budget) -> dict[str, str]:
         if found.n_saturated
         else f"{off} although no chamber is saturated: look for a leak or a slow regulator",
         "payload": f"the loop believes {found.believed_g:.0f} g, and --payload says {found.payload_g:.0f} g: "
-        "record the poses of `calib plan`, and calibrate with them",
+        "record more random poses, and calibrate with them",
         "springs": f"zeros have shifted since the calibration, about [mm]: {zeros}: {again}",
         "estimator": "the distilled pose is off its simulation: only a finer network would help",
-        "S2R": "as large as at the calibration's held-out poses: record the poses of `calib plan`",
+        "S2R": "as large as at the calibration's held-out poses: record more random poses",
         # `--since` fits the springs' zeros, which explain the part `springs` alone.
         "rest": "the pose changes as no spring shows, as by hysteresis, or the arm has changed: " + anew
         if found.calibrated

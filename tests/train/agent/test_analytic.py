@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 def learner():
     """Arms that differ in payload, stiffness and sensor bias."""
     randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05, sensor_noise_mm=0.5)
-    env = ReachEnv(SHORT, EnvConfig(n_poses=256, randomisation=randomisation))
+    env = ReachEnv(SHORT, EnvConfig(engine="chain", n_poses=256, randomisation=randomisation))
     return Analytic(CONFIG, env)
 
 
@@ -107,13 +107,13 @@ def test_a_policy_is_adopted_and_may_observe_less(learner, start):
     smaller = Analytic(dataclasses.replace(FEW, hidden=(8,)), env)
     with pytest.raises(ValueError, match="actor: got layers of"):
         smaller.adopt(jax.eval_shape(smaller.init, jax.random.key(2)), learner.parts(start))
-    carrying = Analytic(FEW, ReachEnv(SHORT, EnvConfig(n_poses=64, observation="payload")))
+    carrying = Analytic(FEW, ReachEnv(SHORT, EnvConfig(engine="chain", n_poses=64, observation="payload")))
     with pytest.raises(ValueError, match="actor: got layers of"):  # it observes other things, not less
         wider.adopt(own, carrying.parts(jax.jit(carrying.init)(jax.random.key(2))))
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("new_share", -0.1)]
+    ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("horizon", 0)]
 )
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=f"learner.{name}: got {value}"):

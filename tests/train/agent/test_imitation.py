@@ -110,47 +110,6 @@ def test_as_printed_the_expert_is_at_the_pose_shown_before_and_relabelled_goals_
     np.testing.assert_allclose(batch.reward, learned - stored.clearance_cost, rtol=1e-5)
 
 
-@pytest.fixture
-def moving(imitation_config, moving_env, shown):
-    """A learner for arms in motion."""
-    return Imitation(imitation_config.learner, moving_env, shown)
-
-
-def test_in_motion_the_expert_acts_for_a_share_of_the_arms(moving, moving_env, shown):
-    state, row = jax.jit(moving.init)(jax.random.PRNGKey(0)), jnp.arange(600) % 6
-    pose, goal = (jnp.asarray(shown.positions)[(row + k) % 6] for k in (0, 1))
-    obs = moving_env.observe(pose, goal, jnp.zeros((600, moving_env.observation_size - 18)))
-    action, expert = moving.act(state, obs, jax.random.PRNGKey(1))
-    own, nobody = moving.learner.act(state.agent, obs, jax.random.PRNGKey(1))
-    assert nobody is None
-    np.testing.assert_array_equal(action[expert], jnp.asarray(shown.actions)[(row + 1) % 6][expert])
-    np.testing.assert_array_equal(action[~expert], own[~expert])
-    assert abs(np.mean(expert) - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 600)
-
-
-def test_in_motion_the_expert_s_actions_are_not_shown_as_the_agent_s(moving, moving_env, stored, shown):
-    """Batches keep them; the discriminator has the agent's in their places."""
-    sensed = jnp.zeros((B, moving_env.observation_size - 18))
-    expert, by_expert = jnp.asarray(shown.actions)[(jnp.arange(B) + 1) % 6], jnp.arange(B) < 5
-    action = jnp.where(by_expert[:, None], expert, stored.action)
-    stored = stored._replace(action=action, sensed=sensed, next_sensed=sensed, by_expert=by_expert)
-    state, seen = jax.jit(moving.init)(jax.random.PRNGKey(0)), {}
-    learn, update = moving.learner.learn, moving.gail.update
-    moving.learner.learn = lambda agent, batch, key: seen.update(batch=batch) or learn(agent, batch, key)
-    moving.gail.update = lambda s, e, a, key: seen.update(expert=e, agent=a) or update(s, e, a, key)
-    after, seen = jax.jit(lambda *given: (moving.update(given[0], lambda *_: given[1], given[2])[0], seen))(
-        state, stored, jax.random.PRNGKey(1)
-    )
-    np.testing.assert_array_equal(seen["batch"].action, action)
-    assert not np.array_equal(*(s.discriminator.params["params"]["head"]["kernel"] for s in (state, after)))
-    (obs, answers), (obs_agent, own) = seen["expert"], seen["agent"]
-    np.testing.assert_array_equal(answers, expert)
-    np.testing.assert_array_equal(obs, obs_agent)
-    assert obs.shape[1] == moving_env.observation_size
-    np.testing.assert_array_equal(own[5:], action[5:])
-    assert np.all(np.any(own[:5] != action[:5], axis=-1))
-
-
 def test_parts_of_other_runs_are_taken(new):
     learner, reach = new(), new().learner
     init = jax.jit(learner.init)

@@ -16,7 +16,7 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
 from tests.train.small import SHORT
 from train.agent.imitation import ImitationConfig
-from train.agent.learner import Explored, Learner, ReplayConfig
+from train.agent.learner import Learner, ReplayConfig
 from train.agent.networks import Actor
 from train.agent.registry import LEARNERS, Entry
 from train.agent.tqc import TQCConfig
@@ -56,7 +56,7 @@ class Regression(Learner):
 
     def act(self, state, obs, key):
         action = self.mode(state[0], obs)
-        return Explored(jnp.clip(action + 0.3 * jax.random.normal(key, action.shape), -1.0, 1.0))
+        return jnp.clip(action + 0.3 * jax.random.normal(key, action.shape), -1.0, 1.0)
 
     def policy(self, state):
         return state[0]

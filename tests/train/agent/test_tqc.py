@@ -1,15 +1,12 @@
 """Losses against loops in NumPy, and one update against what it must and must not depend on."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
-from mjx_softarm.mdp.observation import ERROR, OBS_SIZE
-from train.agent import losses, prior
+from train.agent import losses
 from train.agent.networks import squash
 from train.agent.tqc import TQC, TQCConfig, Transition
 
@@ -252,48 +249,3 @@ BAD |= {"gamma": 1.5, "tau": 0.0, "initial_alpha": 0.0}
 def test_config_names_the_field_out_of_range(field, value):
     with pytest.raises(ValueError, match=rf"learner\.{field}: got .* expected"):
         TQCConfig(**{field: value})
-
-
-def test_a_given_policy_acts_as_before_whatever_it_did_not_observe():
-    """Two more entries of the observation have no weight; the noise is small; the critics stay."""
-    settings = TQCConfig(hidden=(8,), hidden_critic=(8,))
-    donor, wider = (TQC(n, 2, settings) for n in (OBS_SIZE, OBS_SIZE + 2))
-    given, own = (jax.jit(each.init)(jax.random.key(k)) for k, each in enumerate((donor, wider)))
-    adopted = wider.adopt_policy(own, given.mean_actor_params)
-    obs = jax.random.normal(jax.random.key(2), (4, OBS_SIZE + 2))
-    expected = donor.mode(given.mean_actor_params, obs[:, :OBS_SIZE])
-    np.testing.assert_allclose(wider.mode(adopted.mean_actor_params, obs), expected, atol=1e-6)
-    assert np.abs(wider.act(adopted, obs, jax.random.key(3)) - expected).max() < 0.1
-    assert equal(adopted.critic_params, own.critic_params)
-    with pytest.raises(ValueError, match="actor: got layers of"):
-        donor.adopt_policy(given, own.mean_actor_params)
-
-
-def test_an_actor_keeps_to_the_policy_it_is_given_while_the_critics_learn(monkeypatch):
-    monkeypatch.setattr(prior, "WAIT", 2)
-    monkeypatch.setattr(prior, "RISE", 1)
-    agent = TQC(OBS, ACTION, dataclasses.replace(CONFIG, from_policy=True))
-    first, other = (jax.jit(agent.init)(jax.random.key(k)) for k in range(2))
-    start = agent.adopt_policy(first, other.mean_actor_params)
-    states, update = [start], jax.jit(agent.update)
-    for k in range(5):
-        states.append(update(states[-1], make_batch(), jax.random.key(k))[0])
-        assert equal(states[-1].given_params, start.actor_params)
-        assert not equal(states[-1].critic_params, states[-2].critic_params)
-    waits = [equal(state.actor_params, start.actor_params) for state in states]
-    assert waits == [True, True, True, True, False, False]  # the rate is zero at its count of 0, 1 and 2
-    assert [bool(state.log_alpha == start.log_alpha) for state in states] == waits
-
-
-def test_departures_cost_by_their_squares_and_less_far_from_the_goal_and_late():
-    rng = np.random.default_rng(0)
-    obs, action, given = (rng.normal(size=(B, n)).astype(np.float32) for n in (OBS_SIZE, ACTION, ACTION))
-    obs[0] *= 0.02  # an error between the near one and the far one
-    expected = 0.0
-    for k in range(B):
-        departure, error = np.sum((action[k] - given[k]) ** 2), np.sum(obs[k, ERROR] ** 2)
-        expected += prior.WEIGHT * departure / (min(error, prior.FAR**2) + prior.NEAR**2) / B
-    assert prior.departure_cost(obs, action, given, 0.0) == pytest.approx(expected, rel=1e-5)
-    late = prior.departure_cost(obs, action, given, 1.0)
-    assert late == pytest.approx(prior.WEIGHT_END * expected, rel=1e-5)
-    assert prior.departure_cost(obs, given, given, 0.0) == 0.0

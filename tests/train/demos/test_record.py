@@ -8,7 +8,6 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
@@ -27,8 +26,7 @@ DT_S, LAG = 1.0 / SPEC.control.rate_hz, 0.15  # of the way to the commanded pres
 @functools.cache
 def equilibrium():
     params = ArmParams.from_spec(SPEC)
-    kinematics = chain_kinematics(params)
-    return jax.jit(lambda pressure: settle_pressures(kinematics, params, pressure))
+    return jax.jit(lambda pressure: settle_pressures(params, pressure))
 
 
 class BlindArm:

@@ -1,16 +1,13 @@
 """Demonstrated goals: episodes, stages, balance, and a run that continues bit for bit."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from train.agent.imitation import Imitation
-from train.config import ConfigError
 from train.epoch.devices import mesh_of
-from train.epoch.goals import DemonstratedGoals, goal_weights, static_poses
+from train.epoch.goals import DemonstratedGoals, goal_weights
 from train.epoch.job import Job
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -19,11 +16,6 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 def new_job(config, env, shown, mesh=None):
     goals = DemonstratedGoals(config.learner, env, shown)
     return Job(config.learner, env, Imitation(config.learner, env, shown), goals, mesh)
-
-
-@pytest.fixture(scope="module")
-def moving_job(imitation_config, moving_env, shown):
-    return new_job(dataclasses.replace(imitation_config, env=moving_env.config), moving_env, shown)
 
 
 @pytest.fixture(scope="module")
@@ -62,40 +54,6 @@ def test_an_episode_goes_from_one_demonstrated_position_to_another(job):
     assert len(set(indices(job, arm.pose))) > 1
     assert set(indices(job, arm.goal)) <= {0, 2, 4}  # the first stage has every second position
     np.testing.assert_allclose(state.arms.obs, job.env.observe(arm.pose, arm.goal), atol=1e-6)
-
-
-def test_an_episode_in_motion_starts_at_rest_where_the_expert_held_the_arm(moving_job, shown):
-    job = moving_job
-    state = job.init(jax.random.PRNGKey(0))
-    many = jax.jit(jax.vmap(lambda key: job.goals.begin(state.goals, state.arms, key).pipeline_state))
-    arm = jax.tree.map(
-        lambda x: x.reshape(-1, *x.shape[2:]), many(jax.random.split(jax.random.PRNGKey(1), 64))
-    )
-    start, goal = indices(job, arm.pose, 0.01), indices(job, arm.goal)
-    np.testing.assert_allclose(job.env.action_of(arm.spring_m), shown.actions[start], atol=1e-4)
-    assert set(start) == set(range(6)) and not np.any(arm.motion.velocity)
-    follows = np.mean(start == np.maximum(goal - 1, 0))
-    assert abs(follows - (0.5 + 0.5 / 6)) < 4 * np.sqrt(0.25 / len(goal))
-    # Under the expert's action the arm stays there.
-    held = jax.tree.map(lambda x: x[: job.arms.n], arm)
-    arms = state.arms.replace(pipeline_state=held)
-    after = jax.jit(jax.vmap(job.env.step))(arms, jnp.asarray(shown.actions)[start[: job.arms.n]])
-    np.testing.assert_allclose(after.pipeline_state.pose, held.pose, atol=0.05)
-    np.testing.assert_allclose(after.pipeline_state.sensed, held.sensed, atol=0.01)
-
-
-def test_a_run_in_motion_is_traced_once_and_continues_bit_for_bit(moving_job):
-    job, whole = moving_job, continued_bit_for_bit(moving_job)
-    # A quarter of the actions were the expert's.
-    stored = whole.memory.data
-    expert = stored.action == np.asarray(job.learner.actions)[indices(job, stored.goal)]
-    assert 0.05 < np.mean(np.all(expert, axis=-1)) < 0.5
-
-
-def test_actions_at_which_the_arm_does_not_settle_are_named(moving_env, shown):
-    actions = shown.actions.at[2].set(np.nan)
-    with pytest.raises(ConfigError, match="demonstrations: got rows 2, at which the arm does not settle"):
-        static_poses(moving_env, actions)
 
 
 def test_stages_change_the_goals_and_thin_the_replay(job):

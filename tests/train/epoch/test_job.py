@@ -39,7 +39,7 @@ MOVING = {
 }
 
 
-@pytest.mark.parametrize("change", [{}, {"engine": "mjx"}, MOVING], ids=["chain", "mjx", "dynamic"])
+@pytest.mark.parametrize("change", [{}, {"engine": "chain"}, MOVING], ids=["mjx", "chain", "dynamic"])
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
     if config.env.moves:  # with goals that the episode reached later, and critics that observe a prediction
