@@ -29,7 +29,8 @@ LOST_TICKS = 3  # ticks in a row without a reading after which a sensor counts a
 LATE_TICKS = 5  # late ticks in a row after which the arm counts as late; by hand
 VENT_KPA_PER_S = 20.0  # ramp to zero; by hand
 VENT_TRIES = 250  # failed writes in a row after which the arm counts as not vented; some 5 s, by hand
-LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
+LOOKS = 50  # number of frames tried before an arm moves
+LOOK_S = 0.02  # time between two of them
 
 
 def vented(pressure_kpa: Array, dt_s: float) -> Array:

@@ -65,10 +65,10 @@ def record(
             rows.add(row)
 
     drive = Drive(arm, spec, on_tick)
-    began_s = told_s = time.monotonic()
+    began_s = reported_s = time.monotonic()
 
     def run() -> None:
-        nonlocal told_s
+        nonlocal reported_s
         for k, target_kpa in enumerate(targets_kpa, 1):
             # Drive to the pressures, check the arm, log the pose.
             hold.ticks.clear()
@@ -77,12 +77,12 @@ def record(
             if rest[-1] and not transients:
                 rows.add(_mean(hold.last_second()))
 
-            # Tell the progress.
+            # Report the progress.
             now_s = time.monotonic()
-            if now_s - told_s >= PROGRESS_S or k == len(targets_kpa):
+            if now_s - reported_s >= PROGRESS_S or k == len(targets_kpa):
                 left_min = (now_s - began_s) / k * (len(targets_kpa) - k) / 60
                 tell(f"{k} of {len(targets_kpa)} poses, about {left_min:.1f} min left")
-                told_s = now_s
+                reported_s = now_s
 
     def log() -> Log:
         return rows.log("record", drive.sensor)
