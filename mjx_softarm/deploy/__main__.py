@@ -218,7 +218,8 @@ def _report_accuracy(
         out: folder to write to.
         payload_kg: payload at the gripper; None: do not say what makes the error.
     """
-    accuracy, ways = measure(run, controller, poses), ways_of(run)
+    accuracy = measure(run, controller, poses)
+    ways = ways_of(run)
     numbers = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),

@@ -57,7 +57,9 @@ def record(
         tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.
     """
-    rows, hold, rest = Recorder(), _Hold(), []
+    rows = Recorder()
+    hold = _Hold()
+    rest = []
 
     def on_tick(row: dict) -> None:
         hold.add(row, "tip_m" in row or not drive.link.sees)
@@ -148,7 +150,8 @@ class _Hold:
         least_kpa = np.maximum(STUCK_PRESSURE_KPA, LOST_SHARE * np.abs(target_kpa))
         off = np.abs(kpa[-1] - target_kpa) > least_kpa
         if (k := np.flatnonzero(off)).size:
-            got, wanted = kpa[-1, k[0]], target_kpa[k[0]]
+            got = kpa[-1, k[0]]
+            wanted = target_kpa[k[0]]
             raise ArmFault(f"pressures: chamber{k[0]}: got {got:.1f} kPa at rest, expected {wanted:.1f} kPa")
 
 
