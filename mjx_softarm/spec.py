@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from mjx_softarm._support.fields import (
     PerChamber,
@@ -343,6 +342,8 @@ class ArmSpec:
 
     def to_toml(self, path: str | Path) -> None:
         """Write the specification, so that `from_toml` gives an equal one."""
+        import tomli_w
+
         Path(path).write_text(tomli_w.dumps(self.to_dict()), "utf-8")
 
     def replace(self, **groups: dict[str, Any] | str) -> ArmSpec:

@@ -25,9 +25,7 @@ def made(monkeypatch):
 
 @pytest.mark.parametrize("name", PINS)
 def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here(name):
-    requirements = dict(
-        pin.replace("[cuda12]", "").split("==") for pin in peer_packages(name)
-    )
+    requirements = dict(pin.replace("[cuda12]", "").split("==") for pin in peer_packages(name))
     pins = dict(pin.split("==") for pin in PINS[name])
     assert requirements == pins | {shared: metadata.version(shared) for shared in SHARED}
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.policy.actor import policy_from_actor
+from mjx_softarm.policy.file import policy_from_actor
 
 SPEC = ArmSpec.default()
 N = SPEC.n_chambers

@@ -1,52 +1,102 @@
-"""Weights alone: the page's lines of NumPy ask for the readings that the actor asks for in training."""
+"""The actor alone in a file: the page's NumPy runs it, and its scales are those of training."""
 
 import re
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
-from mjx_softarm.env import ReachEnv
-from tests.train.small import CONFIG, SHORT, new_job
+from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm.mdp.observation import (
+    ObsScale,
+    layouts,
+    observe,
+    observe_motion,
+    observe_payload,
+    rate_ticks,
+)
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.policy.file import SHIPPED, load_policy
+from tests.train.small import CONFIG, SHORT
 from train.__main__ import main
+from train.agent.networks import Actor, mode
+from train.runs.export import contents, observation_scaling
 from train.runs.folder import Run
 
-PAGE = Path(__file__).parents[3] / "docs/export.md"
+ROOT = Path(__file__).resolve().parents[3]
+BLOCK = re.search(r"```python\n(.+?)```", (ROOT / "docs/export.md").read_text("utf-8"), re.S)[1]
+SPEC, RNG = SHORT, np.random.default_rng(0)
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A run without training; its environment, its job and its state."""
-    env = ReachEnv(SHORT, CONFIG.env)
-    job = new_job(CONFIG, env)
-    state = job.init(jax.random.PRNGKey(0))
-    run = Run.create(tmp_path_factory.mktemp("runs") / "run", CONFIG, CalibratedArm(SHORT))
-    run.checkpoints.save(0, state, job.parts(state))
-    return run, env, job, state
+@pytest.fixture
+def run(tmp_path):
+    """A run whose actor has random weights."""
+    run = Run.create(tmp_path / "run", CONFIG, CalibratedArm(SPEC))
+    params = Actor(SPEC.n_springs, CONFIG.learner.hidden).init(jax.random.key(3), jnp.zeros(18))
+    run.checkpoints.save(1, {"any": np.zeros(1)}, {"policy": params})
+    return run
 
 
-def test_the_page_s_lines_of_numpy_are_the_actor(trained, tmp_path, monkeypatch, capsys):
-    run, env, job, state = trained
+def test_the_page_s_numpy_gives_the_actions_of_training(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["export", str(run.path), "--weights", "actor.npz"]) == 0
-    assert "weights: actor.npz, " in capsys.readouterr().out
-    assert not (run.path / "policy.npz").exists() and not (run.path / "estimators.npz").exists()
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
-    page: dict = {}
-    exec(code, page)
-    pose, goal = np.float32([[5, -9, -180, 170, 20, -3], [-30, 8, -170, -175, -15, 12]])
-    action = job.learner.mode(job.policy(state), env.observe(pose, goal))
-    expected = env.action_map.readings(action)
-    np.testing.assert_allclose(page["act"](pose, goal), expected, rtol=1e-5)
+    assert len(BLOCK.splitlines()) == 12
+    values = {}
+    exec(BLOCK, values)
+    obs = observe(
+        *(jnp.float32(values[name]) for name in ("pose", "goal")), ObsScale.from_spec(SPEC), RewardConfig()
+    )
+    action = mode(*Actor(SPEC.n_springs, CONFIG.learner.hidden).apply(run.policy(), obs)[:1])
+    assert np.abs(action).max() > 0.05
+    expected = ActionMap.from_spec(SPEC).readings(np.asarray(action, np.float64))
+    np.testing.assert_allclose(values["readings"], expected, rtol=1e-6)
 
 
-def test_weights_go_alone_and_into_a_folder_that_exists(trained, capsys):
-    run = str(trained[0].path)
-    assert main(["export", run, "--weights", "actor.npz", "--onnx"]) == 2
-    assert "--weights: got it with --out, --onnx" in capsys.readouterr().err
-    assert main(["export", run, run, "--weights", "actor.npz"]) == 2
-    assert "RUN: got 2, expected one folder of a run" in capsys.readouterr().err
-    assert main(["export", run, "--weights", "absent/actor.npz"]) == 2
-    assert "absent" in capsys.readouterr().err
+def random_entries(kind):
+    """Return entries of an observation as `layouts` names them, and the observation of training."""
+    pose, goal = (RNG.uniform(-170.0, 170.0, 6) for _ in range(2))
+    reward = RewardConfig(axes=(1.0, 1.0, 1.0, 0.0, 1.0, 1.0))
+    raw, obs = [pose, goal, pose - goal], [observe(pose, goal, ObsScale.from_spec(SPEC), reward)]
+    if kind == "payload":
+        raw.append(np.array([0.3]))
+        obs.append(observe_payload(0.3, SPEC))
+    if kind == "motion":
+        n, c, rate_hz = SPEC.n_springs, SPEC.n_chambers, SPEC.control.rate_hz
+        over_s = rate_ticks(rate_hz) / rate_hz
+        spring, rate, tip, velocity, integral, action = map(RNG.standard_normal, (n, n, 3, 3, c, n))
+        raw += [spring, rate, velocity, integral, action]
+        moves = spring, spring - over_s * rate, tip, tip - over_s * velocity
+        obs.append(observe_motion(*moves, integral, action, SPEC))
+    return reward, np.concatenate(raw), np.concatenate(obs)
+
+
+@pytest.mark.parametrize("kind", ["pose", "payload", "motion"])
+def test_scales_are_those_of_training(kind):
+    reward, raw, expected = random_entries(kind)
+    centre, scale = observation_scaling(SPEC, reward, kind)
+    away = raw - centre
+    away[[3, 4, 5, 9, 10, 11, 15, 16, 17]] = (away[[3, 4, 5, 9, 10, 11, 15, 16, 17]] + 180) % 360 - 180
+    assert len(centre) == len(layouts(SPEC)[kind])
+    np.testing.assert_allclose(away / scale, expected, rtol=2e-6, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "message"),
+    [
+        ({"params": {"other": {}}}, [], "actor parameters: got ['other'], expected hidden_0"),
+        (None, ["--onnx"], "--weights: got --onnx too, expected it alone"),
+        (None, ["absent"], "RUN: got 2, expected one folder of a run"),
+    ],
+)
+def test_what_the_file_cannot_hold_is_refused(policy, options, message, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Run, "policy", lambda run, own=Run.policy: policy or own(run))
+    assert main(["export", str(run.path), *options, "--weights", str(tmp_path / "actor.npz")]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "actor.npz").exists()
+
+
+def test_the_contents_of_a_policy_are_named():
+    lines = "\n".join(contents(load_policy(SHIPPED)))
+    assert "18-192-192-192-192-9, swish" in lines and "tip 0.56 mm" in lines and "2,048 poses" in lines
