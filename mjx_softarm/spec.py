@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from mjx_softarm._support.fields import (
     PerChamber,
@@ -122,9 +121,9 @@ def bonded_stiffness(share: Array, stiffness: Array, square_m2: Array) -> tuple[
     Returns:
         Stiffness [N/m] that each chamber gives; axial [N/m] and bending stiffness [N m/rad] of a section.
     """
-    given = share * stiffness.min(axis=1)
-    axial = stiffness.shape[1] * given
-    return given, axial, axial * square_m2 / 2
+    shared = share * stiffness.min(axis=1)
+    axial = stiffness.shape[1] * shared
+    return shared, axial, axial * square_m2 / 2
 
 
 @dataclass(frozen=True)
@@ -343,6 +342,8 @@ class ArmSpec:
 
     def to_toml(self, path: str | Path) -> None:
         """Write the specification, so that `from_toml` gives an equal one."""
+        import tomli_w
+
         Path(path).write_text(tomli_w.dumps(self.to_dict()), "utf-8")
 
     def replace(self, **groups: dict[str, Any] | str) -> ArmSpec:
@@ -382,8 +383,8 @@ class ArmSpec:
 
         # A negative bond leaves the backbone some stiffness
         backbone = self.backbone.axial_stiffness_n_per_m, self.backbone.bending_stiffness_nm_per_rad
-        for own, bonded in zip(map(self.per_section, backbone), self._bonded(), strict=True):
-            if not np.all(np.add(own, bonded) > 0.0):
+        for stiffness, bonded in zip(map(self.per_section, backbone), self._bonded(), strict=True):
+            if not np.all(np.add(stiffness, bonded) > 0.0):
                 raise SpecError(
                     f"{source}: chambers.bonded_share: got {self.chambers.bonded_share!r}, which takes more "
                     "stiffness than the backbone has, expected a share closer to 0"

@@ -17,7 +17,7 @@ COMMANDS = {
     "reach": "train.runs.command:Reach",
     "imitate": "train.runs.command:Imitate",
     "evaluate": "train.runs.command:evaluate",
-    "export": "train.runs.command:export",
+    "export": "train.runs.export:export",
     "sweep": "train.sweep.command:SweepCommand",
     "demos record": "train.demos.command:Record",
     "demos check": "train.demos.command:Check",

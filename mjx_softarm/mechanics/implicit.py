@@ -69,40 +69,40 @@ class Equilibrium(NamedTuple):
     law_response: Array  # (nv, n_springs) joints by references, zeros unless the law holds the arm
 
 
-def gain_columns(here: Statics, held: Array, params: ArmParams) -> Array:
+def gain_columns(potential: Statics, held: Array, params: ArmParams) -> Array:
     """Return forces (n_sections, n, n_springs, *arms) on the joints by references, through the law's gains.
 
     H^-1 times these forces is `Equilibrium.law_response`. They are zeros for redundant chambers, which are
     not held.
 
     Args:
-        here: at the equilibrium, the gains included.
+        potential: at the equilibrium, the gains included.
         held (n_chambers, *arms): bool, chambers whose gains take part.
         params: numbers of the arm.
     """
-    n_sections, _, n, *arms = here.springs.jacobian.shape
+    n_sections, _, n, *arms = potential.springs.jacobian.shape
     if params.allocation is not None:
-        return jnp.zeros((n_sections, n, *here.springs.length.shape), here.gradient.dtype)
+        return jnp.zeros((n_sections, n, *potential.springs.length.shape), potential.gradient.dtype)
     gain = jnp.where(held, params.law_stiffness, 0.0).reshape(n_sections, -1, 1, *arms)
-    columns = block_diagonal(jnp.swapaxes(gain * here.springs.jacobian, 1, 2))
+    columns = block_diagonal(jnp.swapaxes(gain * potential.springs.jacobian, 1, 2))
     return columns.reshape(n_sections, n, -1, *arms)
 
 
 def equilibrium_tangents(
-    primals: tuple, tangents: tuple, end: Equilibrium, settled: Array
+    primals: tuple, tangents: tuple, equilibrium: Equilibrium, settled: Array
 ) -> EquilibriumTangents:
     """Differentiate an equilibrium along a direction.
 
     Args:
         primals: params (`ArmParams`) and reference_m (n_springs,) of `settle`.
         tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
-        end: the equilibrium.
+        equilibrium: the equilibrium.
         settled () bool: false for a zero derivative.
     """
     # Derivatives at fixed joint coordinates and pressures
     params, reference = primals
     params_dot, reference_dot = tangents
-    q, pressure_kpa, at_limit, frames, here, response, by_law = end
+    q, pressure_kpa, at_limit, frames, potential, response, law_response = equilibrium
     explicit = _explicit_tangents(params, params_dot, q, pressure_kpa)
 
     # Inverse of the chambers' equations
@@ -119,12 +119,12 @@ def equilibrium_tangents(
     if explicit is not None:
         tracking_dot = tracking_dot - explicit.spring_m
     # Joints at constant pressures; the law's gain, where it holds the arm, answers to references at once
-    dq_held = jnp.sum(_masked(by_law, settled) * tracking_dot, axis=-1)
+    dq_held = jnp.sum(_masked(law_response, settled) * tracking_dot, axis=-1)
     if explicit is not None:
         every = jnp.eye(len(q), dtype=q.dtype).reshape(params.n_sections, -1, len(q))
-        compliance = _masked(here.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
+        compliance = _masked(potential.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
         dq_held = dq_held - jnp.sum(compliance * explicit.gradient, axis=-1)
-    tracking_dot = tracking_dot - _along(here.springs.jacobian, dq_held)
+    tracking_dot = tracking_dot - _along(potential.springs.jacobian, dq_held)
     if params.allocation is not None:
         tracking_dot = params.allocation.chamber_error @ tracking_dot
     limit_dot = jax.lax.select(at_high, high_dot, low_dot)
@@ -134,12 +134,12 @@ def equilibrium_tangents(
     dp = jnp.sum(inverse * right, axis=-1)
     dq = jnp.sum(dq_dp * dp, axis=-1) + dq_held
     tip_dot, rotation_dot = _tip_tangents(frames, dq)
-    spring_dot = _along(here.springs.jacobian, dq)
+    spring_dot = _along(potential.springs.jacobian, dq)
     if explicit is not None:
         spring_dot = spring_dot + explicit.spring_m
         tip_dot, rotation_dot = tip_dot + explicit.tip_position_m, rotation_dot + explicit.tip_rotation
-    found = EquilibriumTangents(dq, dp, spring_dot, tip_dot, rotation_dot)
-    return EquilibriumTangents(*(_masked(x, settled) for x in found))
+    result = EquilibriumTangents(dq, dp, spring_dot, tip_dot, rotation_dot)
+    return EquilibriumTangents(*(_masked(x, settled) for x in result))
 
 
 class _Explicit(NamedTuple):
@@ -168,8 +168,10 @@ def _explicit_tangents(
             merged[k] = value
         arm = jax.tree.unflatten(structure, merged)
         frames = chain_kinematics(arm)(q)
-        here = statics(frames, q, pressure_kpa, arm)
-        return _Explicit(here.gradient, here.springs.length, frames.tip_position, frames.tip_rotation)
+        potential = statics(frames, q, pressure_kpa, arm)
+        return _Explicit(
+            potential.gradient, potential.springs.length, frames.tip_position, frames.tip_rotation
+        )
 
     return jax.jvp(observables, [numbers[k] for k in changing], [directions[k] for k in changing])[1]
 

@@ -86,7 +86,7 @@ class ArmParams(NamedTuple):
         limit = jnp.full_like(self.area, jnp.inf)
         return self._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
 
-    def answering(self, held: Array, reference_m: Array) -> ArmParams:
+    def with_law_gain(self, held: Array, reference_m: Array) -> ArmParams:
         """Return the arm with the law's proportional gain as springs about the references, where `held`.
 
         This changes no equilibrium at which these springs are on their references, but it may make it stable.

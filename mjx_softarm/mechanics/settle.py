@@ -114,11 +114,11 @@ def settle(params: ArmParams, reference_m: Array, n_at_once: int | None = None) 
 
 def _settle_jvp(n_at_once: int | None, primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
     # A second small step brings the response, which is that before the last step, up to date
-    found, end = _solver(2, n_at_once)(*primals)
+    settled, equilibrium = _solver(2, n_at_once)(*primals)
     with jax.default_matmul_precision("highest"):
-        change = equilibrium_tangents(primals, tangents, end, found.settled)
-    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
-    return found, none._replace(**change._asdict())
+        tangent = equilibrium_tangents(primals, tangents, equilibrium, settled.settled)
+    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in settled))
+    return settled, none._replace(**tangent._asdict())
 
 
 settle.defjvp(_settle_jvp, symbolic_zeros=True)
@@ -141,10 +141,10 @@ def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
         if n_at_once and n_at_once < n:
-            found = xla.in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
+            solutions = xla.in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
         else:
-            found = _solve_arms_last(n_small, n, batched, *arguments)
-        return found, jax.tree.map(lambda _: True, found)
+            solutions = _solve_arms_last(n_small, n, batched, *arguments)
+        return solutions, jax.tree.map(lambda _: True, solutions)
 
     solve.def_vmap(many)
     return solve
@@ -155,13 +155,13 @@ def _solve_arms_last(
 ) -> _Solution:
     """Return the solutions of n arms; `batched` is true for arrays that have the arms as first axis."""
 
-    def arms_last(x: Any, own: bool) -> Array:
-        return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
+    def arms_last(x: Any, is_batched: bool) -> Array:
+        return jnp.moveaxis(x, 0, -1) if is_batched else jnp.asarray(x)[..., None]
 
-    params_own, reference_own = batched
-    reference_m = jnp.broadcast_to(arms_last(reference_m, reference_own), (reference_m.shape[-1], n))
-    found = _solve(n_small, jax.tree.map(arms_last, params, params_own), reference_m)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
+    params_batched, reference_batched = batched
+    reference_m = jnp.broadcast_to(arms_last(reference_m, reference_batched), (reference_m.shape[-1], n))
+    solutions = _solve(n_small, jax.tree.map(arms_last, params, params_batched), reference_m)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solutions)
 
 
 def _solve(n_small: int, params: ArmParams, reference_m: Array) -> _Solution:
@@ -188,49 +188,51 @@ def _solve(n_small: int, params: ArmParams, reference_m: Array) -> _Solution:
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         shapes = jax.eval_shape(one_pass, start)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        _, it, end = jax.lax.while_loop(
+        _, iterate, evaluation = jax.lax.while_loop(
             lambda loop: loop[0],
             lambda loop: (jnp.any(loop[1].goes_on(n_small, params)), *one_pass(loop[1])),
             (jnp.array(True), start, nothing),
         )
-        return _report(it, end, params, reference_m)
+        return _report(iterate, evaluation, params, reference_m)
 
 
-def _report(it: Iterate, end: End, params: ArmParams, reference_m: Array) -> _Solution:
+def _report(iterate: Iterate, evaluation: Evaluation, params: ArmParams, reference_m: Array) -> _Solution:
     """Return the last iterate as an equilibrium, with its errors and its result."""
-    pressure, frames, here, by_law = end
-    residual = jnp.max(jnp.abs(here.gradient), axis=0)
+    pressure, frames, potential, law_response = evaluation
+    residual = jnp.max(jnp.abs(potential.gradient), axis=0)
 
     # Errors of the law: at a limit, only an error counts that would take the chamber away from it
-    error = _law_errors(reference_m - here.springs.length, pressure, params.allocation)
+    error = _law_errors(reference_m - potential.springs.length, pressure, params.allocation)
     at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
     outward = jnp.where(pressure >= params.pressure_max_kpa, error, -error)
     off = jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error))
     tracking = jnp.max(jnp.where(params.pinned, 0.0, off), axis=0)
 
     # Result, and all fields of the equilibrium; forces balance in an arm that is about to buckle, too
-    convex = it.convex if params.contact is None else it.convex & ~is_jammed(params.contact, frames)
+    convex = iterate.convex if params.contact is None else iterate.convex & ~is_jammed(params.contact, frames)
     good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M) & convex
-    numbers = here.gradient, error, params.law_stiffness
+    numbers = potential.gradient, error, params.law_stiffness
     finite = functools.reduce(jnp.logical_and, (jnp.all(jnp.isfinite(x), axis=0) for x in numbers))
     result = jnp.select(
         [~finite, good, ~convex],
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
         SettleResult.OUT_OF_ITERATIONS.value,
     )
-    found = Settled(
-        q=it.q,
+    settled = Settled(
+        q=iterate.q,
         pressure_kpa=pressure,
-        spring_m=here.springs.length,
+        spring_m=potential.springs.length,
         tip_position_m=frames.tip_position,
         tip_rotation=frames.tip_rotation,
         at_limit=at_limit,
         residual=residual,
         tracking_error_m=tracking,
         result=result.astype(jnp.int32),
-        iterations=it.iteration,
+        iterations=iterate.iteration,
     )
-    return found, Equilibrium(it.q, pressure, at_limit, frames, here, it.response, by_law)
+    return settled, Equilibrium(
+        iterate.q, pressure, at_limit, frames, potential, iterate.response, law_response
+    )
 
 
 class Iterate(NamedTuple):
@@ -252,7 +254,7 @@ class Iterate(NamedTuple):
         return (self.n_small < n_small) & (self.iteration < most + n_small - 1)
 
 
-class End(NamedTuple):
+class Evaluation(NamedTuple):
     """Forces and springs of all arms at an iterate."""
 
     pressure: Array  # (n_chambers, *arms) [kPa]
@@ -262,41 +264,45 @@ class End(NamedTuple):
 
 
 @jax.jit  # traced once for the loop, the shapes of its results, and both values of n_small
-def _newton_pass(n_small: Array, params: ArmParams, reference_m: Array, it: Iterate) -> tuple[Iterate, End]:
+def _newton_pass(
+    n_small: Array, params: ArmParams, reference_m: Array, iterate: Iterate
+) -> tuple[Iterate, Evaluation]:
     """Return the next iterate, and forces and springs at the given one.
 
     Arms that have ended keep their numbers. If all have, pressures are clipped to their limits, and the
     joints' response to the law's gain is solved for in the place of a Newton step.
     """
     # Forces and springs at the iterate
-    goes_on, held = it.goes_on(n_small, params), it.held & ~it.at_limit
+    goes_on, held = iterate.goes_on(n_small, params), iterate.held & ~iterate.at_limit
     is_last = ~jnp.any(goes_on)
-    clipped = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
-    pressure = jnp.where(is_last, clipped, it.pressure)
-    frames = chain_kinematics(params)(it.q)
-    here = statics(frames, it.q, pressure, params.answering(held, reference_m))
+    clipped = jnp.clip(iterate.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
+    pressure = jnp.where(is_last, clipped, iterate.pressure)
+    frames = chain_kinematics(params)(iterate.q)
+    potential = statics(frames, iterate.q, pressure, params.with_law_gain(held, reference_m))
 
     # Joints by the forces and by each pressure: H^-1 (-grad V) and H^-1 B. Hanging arms are seldom held
-    hessian = here.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
-    push = here.push_per_kpa
-    columns = jnp.concatenate([-here.gradient.reshape(*push.shape[:2], 1, *push.shape[3:]), push], axis=2)
-    gains = gain_columns(here, held, params)
-    padding = [(0, n - own) for own, n in zip(gains.shape, columns.shape, strict=True)]
+    hessian = potential.hessian.plus_diagonal(iterate.stiffening * params.joint_stiffness)
+    push = potential.push_per_kpa
+    columns = jnp.concatenate(
+        [-potential.gradient.reshape(*push.shape[:2], 1, *push.shape[3:]), push], axis=2
+    )
+    gains = gain_columns(potential, held, params)
+    padding = [(0, n - n_gains) for n_gains, n in zip(gains.shape, columns.shape, strict=True)]
     columns = jnp.where(is_last, jnp.pad(gains, padding), columns)
     solved = jax.lax.cond(is_last & ~jnp.any(held), jnp.zeros_like, hessian.solve, columns)
 
     # Step of the arms that go on
-    at = it._replace(pressure=pressure)
-    moved = _newton_step(at, frames, here, solved, params, reference_m)
-    moved = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), moved, it)
-    by_law = solved[:, :, : len(reference_m)].reshape(len(it.q), *reference_m.shape)
-    return moved, End(pressure, frames, here, by_law)
+    clipped_iterate = iterate._replace(pressure=pressure)
+    stepped = _newton_step(clipped_iterate, frames, potential, solved, params, reference_m)
+    stepped = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), stepped, iterate)
+    law_response = solved[:, :, : len(reference_m)].reshape(len(iterate.q), *reference_m.shape)
+    return stepped, Evaluation(pressure, frames, potential, law_response)
 
 
 def _newton_step(
-    it: Iterate,
+    iterate: Iterate,
     frames: Frames,
-    here: Statics,
+    potential: Statics,
     solved: Array,
     params: ArmParams,
     reference_m: Array,
@@ -304,47 +310,51 @@ def _newton_step(
     """Return the iterate after a step in joint coordinates and pressures together: H dq = B dp - grad V.
 
     Args:
-        it: iterate.
+        iterate: start of the step.
         frames: at the iterate.
-        here: forces and springs at the iterate.
+        potential: forces and springs at the iterate.
         solved (n_sections, n, 1 + n_chambers, *arms): H^-1 [-grad V, B].
         params: numbers of the arm.
         reference_m (n_springs, *arms): spring lengths that the law tracks.
     """
     # Active set: chambers that leave the limits are held there
-    error = _law_errors(reference_m - here.springs.length, it.pressure, params.allocation)
-    trial = it.pressure + ACTIVE_SET_GAIN_KPA_PER_M * error
+    error = _law_errors(reference_m - potential.springs.length, iterate.pressure, params.allocation)
+    trial = iterate.pressure + ACTIVE_SET_GAIN_KPA_PER_M * error
     limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
     at_limit = (trial != limit) | params.pinned  # a pinned chamber even where its error is zero
 
     # Pressures: each chamber closes its error or goes to its limit
     newton_step, dq_dp = solved[:, :, 0], solved[:, :, 1:]
-    spring_response = products(here.springs.jacobian, solved).reshape(len(reference_m), -1, *error.shape[1:])
+    spring_response = products(potential.springs.jacobian, solved).reshape(
+        len(reference_m), -1, *error.shape[1:]
+    )
     closed, closed_per_kpa = _closed_errors(spring_response[:, 0], spring_response[:, 1:], params.allocation)
     rows = jnp.where(at_limit[:, None], identity(len(error), closed_per_kpa), closed_per_kpa)
-    residual = jax.lax.select(at_limit, limit - it.pressure, error - closed)
+    residual = jax.lax.select(at_limit, limit - iterate.pressure, error - closed)
     dp = eliminate(rows, residual[:, None])[:, 0]
-    dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(it.q.shape)
+    dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(iterate.q.shape)
 
     # Step length; where elimination gave NaN, the arm stays. If any chamber tracks, the law's gain takes part
     # from now on; if it does already, or none tracks, the joints are stiffer for a step
     largest = jnp.max(jnp.abs(dq), axis=0)
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     if params.contact is not None:
-        scale = scale * step_share(params.contact, frames, chain_kinematics(params)(it.q + scale * dq))
+        scale = scale * step_share(params.contact, frames, chain_kinematics(params)(iterate.q + scale * dq))
     finite = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
-    convex = finite & (it.stiffening == 0)
-    small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < _small_step(params)) & convex
+    convex = finite & (iterate.stiffening == 0)
+    small = jnp.all(at_limit == iterate.at_limit, axis=0) & (largest < _small_step(params)) & convex
     return Iterate(
-        q=jnp.where(finite, it.q + scale * dq, it.q),
-        pressure=jnp.where(finite, it.pressure + scale * dp, it.pressure),
+        q=jnp.where(finite, iterate.q + scale * dq, iterate.q),
+        pressure=jnp.where(finite, iterate.pressure + scale * dp, iterate.pressure),
         at_limit=at_limit,
-        response=PressureResponse(dq_dp.reshape(it.response.dq_dp.shape), closed_per_kpa),
-        n_small=jnp.where(small, it.n_small + 1, 0),
-        held=it.held | ~finite,
-        stiffening=jnp.where(finite | ~(it.held | jnp.all(at_limit, axis=0)), 0.0, 4.0 * it.stiffening + 4.0),
+        response=PressureResponse(dq_dp.reshape(iterate.response.dq_dp.shape), closed_per_kpa),
+        n_small=jnp.where(small, iterate.n_small + 1, 0),
+        held=iterate.held | ~finite,
+        stiffening=jnp.where(
+            finite | ~(iterate.held | jnp.all(at_limit, axis=0)), 0.0, 4.0 * iterate.stiffening + 4.0
+        ),
         convex=convex,
-        iteration=it.iteration + 1,
+        iteration=iterate.iteration + 1,
     )
 
 

@@ -230,7 +230,7 @@ def test_record_tells_its_arm_and_a_twin_of_another(words, told, tmp_path, monke
         tmp_path / "wide.toml"
     )
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: LinearArm())
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: LinearArm())
     main(["record", "--arm", *words, "--out", "a.csv", "--poses", "1"])
     assert told in capsys.readouterr().out
 
@@ -257,7 +257,7 @@ def test_another_arm_than_the_policy_s_gets_no_pressure(n, reading, message, tmp
             raise AssertionError("pressures were written")
 
     save_policy(tmp_path / "policy.npz", POLICY)
-    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: Other())
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: Other())
     goal = "--goal=" + ",".join(map(str, POLICY.workspace[0]))
     assert main(["run", str(tmp_path / "policy.npz"), "--arm", "its:Arm", goal]) == 2
     assert re.search(f"error: --arm its:Arm: {message}", capsys.readouterr().err)

@@ -140,7 +140,7 @@ def test_resume_says_that_a_run_without_a_checkpoint_begins_anew(tmp_path, monke
 
 def test_export_reads_the_policy_before_it_distils(tmp_path, monkeypatch, capsys):
     run = Run.create(tmp_path, CONFIG, CalibratedArm(SHORT))
-    monkeypatch.setattr("train.runs.command.arm_model", lambda *_: pytest.fail("distilled"))
+    monkeypatch.setattr("train.runs.arm_model.arm_model", lambda *_: pytest.fail("distilled"))
     assert main(["export", str(tmp_path)]) == 2
     assert f"{tmp_path}: got no checkpoint, expected one" in capsys.readouterr().err
     monkeypatch.setattr(Run, "policy", lambda run: {"params": {"other": {}}})

@@ -1,4 +1,4 @@
-"""Commands `python -m train reach | imitate | evaluate | export`."""
+"""Commands `python -m train reach | imitate | evaluate`."""
 
 from __future__ import annotations
 
@@ -17,27 +17,18 @@ from rich.table import Table
 from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
-from mjx_softarm.export.write import export_cpp, export_onnx
 from train.agent.imitation import ImitationConfig
 from train.config import ConfigError, TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
 from train.epoch import devices
-from train.options import ArmOptions, NewRunOptions, ReachOptions, named, start
+from train.options import NewRunOptions, ReachOptions, named, start
 from train.presets import IMITATION_PRESETS
 from train.runs import run as runs
-from train.runs.arm_model import arm_model
-from train.runs.checkpoint import RunError
 from train.runs.evaluate import N_ACTIONS
-from train.runs.export import check_policy, export_run
 from train.runs.folder import Run
 from train.runs.lock import sole_trainer
-from train.runs.renew import renewed, told_enough
 from train.runs.task import Task, task_of
 
-Runs = Annotated[
-    tyro.conf.Positional[tuple[Path, ...]],
-    tyro.conf.arg(metavar="RUN [RUN ...]", help="folders of runs", help_behavior_hint="(required)"),
-]
 Devices = Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="D", help=devices.HELP)]
 
 
@@ -184,42 +175,6 @@ def evaluate(
     write_json(file, summary.to_dict())
     console.print(f"written: {file}", highlight=False, soft_wrap=True)
     return 0
-
-
-def export(
-    folders: Runs,
-    out: cli.MaybePath = None,
-    onnx: bool = False,
-    cpp: cli.MaybePath = None,
-    calibration: cli.MaybePath = None,
-) -> int:
-    """Write policies as npz files, and for other runtimes.
-
-    Args:
-        out: file to write, for one run; None: policy.npz in its folder
-        onnx: write ONNX graphs and golden rows beside it
-        cpp: folder for a C++ header, programs and golden rows, for one run
-        calibration: later calibration of the same arm, whose models the policies get without training; None
-            for the file means policy-NAME.npz after this folder. Exit status 1 if a policy needs training
-    """
-    if not folders or ((out or cpp) and len(folders) > 1):
-        expected = "one folder of a run" + ("" if out or cpp else " or more")
-        raise RunError(f"RUN: got {len(folders)}, expected {expected}")
-    console, enough = start(), True
-    for path in folders:
-        run, file, keeps = Run.open(path), out, path
-        check_policy(run)  # before the networks are distilled, which takes a minute
-        # A later calibration takes the place of the run's
-        if calibration:
-            later = renewed(run, ArmOptions(calibration=calibration).read_arm(console))
-            enough &= told_enough(run, later, calibration, console)
-            run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
-        policy = export_run(run, arm_model(run.arm, keeps, console.print), file)
-        console.print(f"policy: {policy}", highlight=False, soft_wrap=True)
-        files = export_onnx(policy) if onnx else []
-        for file in [*files, *(export_cpp(policy, cpp) if cpp else [])]:
-            console.print(f"  {file}", highlight=False, soft_wrap=True)
-    return 0 if enough else 1
 
 
 def _mesh(text: str | None, console: Console) -> Mesh | None:
