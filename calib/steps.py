@@ -31,10 +31,10 @@ from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import motion, sections
 from calib.report.changes import CHANGES, PAYLOADS, changes_section, payloads_section
 from calib.report.page import Section
-from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.pose_pairs import PosePairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.sensing.held_pressures import HeldPressures
+from mjx_softarm.sensing.load import KNOWN
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, extrapolation
 from mjx_softarm.spec import ArmSpec, Unmodelled
@@ -165,7 +165,7 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     largest_kg = spec.mass.largest_payload_kg
     at = payload_poses(CalibratedArm(spec, extras.get("s2r")))
     widths_kg = told_widths(held.held, at, largest_kg)
-    section = sections.with_pressures(section, held, widths_kg, LOOP.load_known * largest_kg)
+    section = sections.with_pressures(section, held, widths_kg, KNOWN * largest_kg)
     return StepResult(spec, section, extras)
 
 

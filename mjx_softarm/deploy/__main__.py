@@ -6,36 +6,36 @@ However a command ends, the arm is vented and what was logged is written.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.accuracy.budget import budget, draw
-from mjx_softarm.deploy.accuracy.measure import (
+from mjx_softarm.deploy.budget import budget, draw
+from mjx_softarm.deploy.capture import CapturedArm, with_capture
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.drivers.names import check_arm, check_number, open_arm, twin_spec
+from mjx_softarm.deploy.ending import MISSED, save_log
+from mjx_softarm.deploy.link import first_frame
+from mjx_softarm.deploy.measure import (
     along,
     figures,
     measure,
+    print_figures,
+    print_run,
     read_goals,
     ways_of,
     whole_goal,
     write_accuracy,
 )
-from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
-from mjx_softarm.deploy.controller import LOOP, Controller
-from mjx_softarm.deploy.drivers.driven import Arms, finish
-from mjx_softarm.deploy.drivers.names import twin_spec
-from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
-from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
-from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.session import follow, trace
+from mjx_softarm.deploy.session import LoopRun, follow, trace
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import growing, random_pressures
@@ -65,12 +65,40 @@ PolicyFile = Annotated[
         help_behavior_hint="(default: the package's own, for the paper's arm)",
     ),
 ]
-GoOn = Annotated[
-    bool,
+Arm = Annotated[
+    str,
     tyro.conf.arg(
-        help="go on without the first chamber that loses its pressure, with the others, instead of venting"
+        help="yours: package.module:Class, or a file of hardware, wiring.toml; simulated: twin:SEED, or "
+        "twin:rod:SEED; twin:SEED@ARM.toml, of another arm; twin:SEED:pipe300, in a pipe; "
+        "twin:SEED:aged, later; twin:SEED:exact, as specified; twin:SEED:500g, with a payload"
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """Options of a command that drives an arm: the arm, and motion capture beside its driver."""
+
+    arm: Arm
+    capture: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="SYSTEM:HOST:BODY",
+            help="natnet:HOST:BODY or qualisys:HOST:BODY, for an arm whose driver has no motion capture; "
+            "options: ,base=BODY,markers=NAME,up=y|z",
+        ),
+    ] = None
+
+    def open(self, spec: ArmSpec, tell: Callable[[str], None]) -> Any:
+        """Open the driver of an arm with this specification, and its motion capture, which reports its gaps.
+
+        Raises:
+            InputError: one of them is not available.
+        """
+        return with_capture(open_arm(self.arm), self.capture, spec, tell)
+
+
+Arms = Annotated[ArmOptions, tyro.conf.arg(name="")]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,13 +108,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-    on: Arms,
+    options: Arms,
     goal: tyro.conf.UseAppendAction[tuple[Goal, ...]],
     policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     log: cli.MaybePath = None,
     duration: float = np.inf,
     stay: bool = False,
-    go_on: GoOn = False,
 ) -> int:
     """Bring the tip to goals; errors are by motion capture if the arm has it.
 
@@ -102,11 +129,11 @@ def _run(
         raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
-    controller = _controller(policy, go_on)
+    controller = _controller(policy)
     goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
-    driver = on.open(controller.policy.spec, tell)
-    check_arm(driver, controller, f"--arm {on.arm}")
+    driver = options.open(controller.policy.spec, tell)
+    check_arm(driver, controller, f"--arm {options.arm}")
 
     # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
@@ -115,25 +142,24 @@ def _run(
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver, tell)
-    tell_run(run, controller.policy)
+    print_run(run, controller.policy)
     return run.status
 
 
-def _controller(policy: Path, go_on: bool) -> Controller:
+def _controller(policy: Path) -> Controller:
     if policy == SHIPPED:
         tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
-    return Controller.of(load_policy(policy), config=replace(LOOP, go_on=go_on))
+    return Controller.of(load_policy(policy))
 
 
 def _measure(
-    on: Arms,
+    options: Arms,
     out: Path,
     policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
     points: int = 16,
     seconds: float | None = None,
     payload: float = 0.0,
-    go_on: GoOn = False,
 ) -> int:
     """Measure a policy's accuracy on an arm with motion capture, and say what makes the error.
 
@@ -149,19 +175,15 @@ def _measure(
         raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
-    if seconds is not None and go_on:
-        raise InputError(
-            f"--go-on: got --seconds {seconds:g}, expected stops: a goal that moves does not wait"
-        )
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
-    controller = _controller(policy, go_on)
+    controller = _controller(policy)
     poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
-    driver = on.open(controller.policy.spec, tell)
-    first_frame(driver, f"--arm: {on.arm}")
-    check_arm(driver, controller, f"--arm {on.arm}")
+    driver = options.open(controller.policy.spec, tell)
+    first_frame(driver, f"--arm: {options.arm}")
+    check_arm(driver, controller, f"--arm {options.arm}")
 
     # The run, stop by stop or in time
     out.mkdir(parents=True)
@@ -179,12 +201,12 @@ def _measure(
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     finish(driver, tell)
     if run.arrivals:
-        _tell_measured(run, controller, poses, out, payload_kg if seconds is None else None)
-    tell_run(run, controller.policy)
+        _report_accuracy(run, controller, poses, out, payload_kg if seconds is None else None)
+    print_run(run, controller.policy)
     return run.status
 
 
-def _tell_measured(
+def _report_accuracy(
     run: LoopRun, controller: Controller, poses: np.ndarray, out: Path, payload_kg: float | None
 ) -> None:
     """Write and print the figures of a run, and what makes its error.
@@ -196,27 +218,28 @@ def _tell_measured(
         out: folder to write to.
         payload_kg: payload at the gripper; None: do not say what makes the error.
     """
-    accuracy, ways = measure(run, controller, poses), ways_of(run)
-    found = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
+    accuracy = measure(run, controller, poses)
+    ways = ways_of(run)
+    numbers = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
         **(along(ways, controller.dt_s) if ways else {}),
     }
     split = None if payload_kg is None else budget(run, controller, payload_kg)
     if split is not None:
-        found["budget"] = split.figures()
-    if missing := write_accuracy(out, accuracy, found, ways):
+        numbers["budget"] = split.figures()
+    if missing := write_accuracy(out, accuracy, numbers, ways):
         print(missing)
     elif split is not None:
         draw(split, out / "budget.png")
-    tell_accuracy(found)
+    print_figures(numbers)
     if split is not None:
         print("\n".join(split.lines()))
     print(f"figures: {out / 'accuracy.json'}")
 
 
 def _record(
-    on: Arms,
+    options: Arms,
     out: Path,
     spec: cli.SpecFile = None,
     poses: int = 500,
@@ -234,19 +257,19 @@ def _record(
     # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
-    own = twin_spec(on.arm)
-    arm_spec = ArmSpec.of(spec or own)
+    twin = twin_spec(options.arm)
+    arm_spec = ArmSpec.of(spec or twin)
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
 
-    driver = on.open(arm_spec, tell)
-    check_number(driver, arm_spec, f"--arm {on.arm}")
+    driver = options.open(arm_spec, tell)
+    check_number(driver, arm_spec, f"--arm {options.arm}")
     low, high = arm_spec.chambers.pressure_min_kpa, arm_spec.chambers.pressure_max_kpa
-    default = "" if spec or own else ", by default; --spec names another arm"
+    default = "" if spec or twin else ", by default; --spec names another arm"
     tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
-    if spec and on.arm.startswith("twin:") and ArmSpec.of(own).geometry != arm_spec.geometry:
-        tell(f"{on.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
+    if spec and options.arm.startswith("twin:") and ArmSpec.of(twin).geometry != arm_spec.geometry:
+        tell(f"{options.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results
     targets_kpa = growing(random_pressures(arm_spec, poses, seed))
@@ -263,6 +286,12 @@ def _record(
     if result.ending.cause:
         print(f"ended early: {result.ending.cause}", file=sys.stderr)
     return result.ending.status
+
+
+def finish(driver: Any, tell: Callable[[str], None]) -> None:
+    """End the motion capture that `--capture` began, and report its frames in a line."""
+    if isinstance(driver, CapturedArm):
+        tell(driver.finish())
 
 
 def tell(text: str) -> None:

@@ -13,9 +13,9 @@ import numpy as np
 
 from mjx_softarm.control import Gains, LawState, at_chambers, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.belief import read_lengths, still
-from mjx_softarm.deploy.controller import LOOP
-from mjx_softarm.deploy.link import VENT_KPA_PER_S, ArmFault, Link
+from mjx_softarm.deploy.belief import read_lengths
+from mjx_softarm.deploy.link import LOST_TICKS, VENT_KPA_PER_S, ArmFault, Link
+from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S, WINDOW_S, still
 from mjx_softarm.spec import ArmSpec
 
 RAMP_M_PER_S = 0.03  # speed of the reference with the longest way
@@ -42,7 +42,9 @@ class Hold:
     """Sensor-space law from the first lengths to references (n_springs,) [m]."""
 
     def __init__(self, gains: Gains, reference_m: np.ndarray, dt_s: float):
-        self._gains, self._goal_m, self._dt_s = gains, np.asarray(reference_m, float), dt_s
+        self._gains = gains
+        self._goal_m = np.asarray(reference_m, float)
+        self._dt_s = dt_s
         self.reference_m: np.ndarray | None = None  # on its way; None before the first reading
         self._state: Any = None
         self._off_m: Any = np.inf  # (n_springs,) running mean of the error
@@ -52,7 +54,8 @@ class Hold:
         if spring_m is None:
             return in_force_kpa, False
         if self.reference_m is None:
-            self.reference_m, self._state = spring_m, LawState.at_rest(in_force_kpa, spring_m)
+            self.reference_m = spring_m
+            self._state = LawState.at_rest(in_force_kpa, spring_m)
             self._off_m = spring_m - self._goal_m
         # References a tick further, pressures, running mean of the error
         left_m = self._goal_m - self.reference_m
@@ -77,14 +80,16 @@ class Drive:
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
         self.on_tick = on_tick
-        self.spec, self.sensor, self.gains = spec, spec.spring_sensor, Gains.from_spec(spec)
+        self.spec = spec
+        self.sensor = spec.spring_sensor
+        self.gains = Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
-        self.window = max(2, round(LOOP.window_s * spec.control.rate_hz))
+        self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
         self.link = Link(arm, spec, self.dt_s)
         self.n_lost = 0
 
     def to_rest(
-        self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = LOOP.settle_timeout_s
+        self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = SETTLE_TIMEOUT_S
     ) -> dict | None:
         """Drive until the springs are at rest and the law has reached its target.
 
@@ -127,7 +132,7 @@ class Drive:
         self.n_lost = self.n_lost + 1 if lost.any() else 0
         known_m = None if lost.any() else spring_m
         try:
-            most = LOOP.lost_ticks
+            most = LOST_TICKS
             if self.n_lost >= most:
                 raise ArmFault(
                     f"sensors: got {self.n_lost} lost readings in a row, expected under {most}: {text}"

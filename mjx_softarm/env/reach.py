@@ -80,7 +80,6 @@ class ReachEnv(brax_envs.Env):
         self.episode_motion = EpisodeMotion(self.spec, self.config)
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *jax.device_put([np.float32(limit) for limit in limits]))
-        self.params = self.params._replace(contact=self.config.contact(self.spec))
         self.walls = Walls(self.config.pipe, self.spec, self.params, s2r)
 
         # Simulation, and the poses that starts and goals are drawn from
@@ -248,8 +247,10 @@ class ReachEnv(brax_envs.Env):
         if config.moves:
             moving = MovingArm(self.model, self._data, params, arm.moving)
             times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
-            engine = midpoint if config.engine == "mjx" else mjx_step
-            return engine.advance(moving, arm.motion, reference_m, self.gains, *times_s)
+            told = moving, arm.motion, reference_m, self.gains, *times_s
+            if config.engine == "mjx":
+                return midpoint.advance(*told, self.n_at_once)
+            return mjx_step.advance(*told)
         end = settle(params, reference_m, self.n_at_once)
         if config.engine == "mjx":
             end = mjx_rest.measured(self.model, self._data, params, end)

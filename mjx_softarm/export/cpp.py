@@ -17,14 +17,18 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.safety import Fault, Response
+from mjx_softarm.deploy.link import LATE_TICKS, LOST_TICKS
+from mjx_softarm.deploy.safety import MOVING_WINDOWS, OVERLOAD, REST_WINDOWS, Fault, Response
+from mjx_softarm.deploy.strategy import CORRECTION_SHARE, N_CORRECTIONS, SHARES
 from mjx_softarm.export.computations import Computation, parts
 from mjx_softarm.export.golden import FLAGS, PROGRAM_VERSION
 from mjx_softarm.export.symbols import REDUCTIONS, Symbol, ordered
+from mjx_softarm.mdp.actions import SHIFT_LIMIT
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import file_entries
+from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
 from mjx_softarm.policy.reach import N_STEPS, begin
-from mjx_softarm.sensing.load import HIGHEST, JUMP, LOWEST, N_AVERAGED, N_JUMPS, QUANTILE
+from mjx_softarm.sensing.load import HIGHEST, JUMP, KNOWN, LOWEST, N_AVERAGED, N_JUMPS, QUANTILE
 
 _TEMPLATES = ("softarm.hpp.in", "rows.cpp", "example.cpp", "CMakeLists.txt")
 _TYPES = {"float64": "double", "float32": "float", "int32": "int", "int64": "int", "bool": "bool"}
@@ -55,7 +59,7 @@ _FOLDS = {
 def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
     """Return the text of each file by its name."""
     # Functions and numbers of the policy.
-    policy, config = controller.policy, controller.config
+    policy = controller.policy
     numbers = Numbers(file_entries(policy))
     functions = [function(name, part, numbers) for name, part in parts(controller).items()]
     faults = [f"  {fault.name} = 1u << {k},  // {fault.response.value}" for k, fault in enumerate(Fault)]
@@ -80,11 +84,11 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "N_ACTIONS": policy.n_actions,
         "ACTION": repr(float(policy.action_s)),
         "RATE_TICKS": rate_ticks(policy.rate_hz),
-        "LOST_TICKS": config.lost_ticks,
-        "LATE_TICKS": config.late_ticks,
-        "REST_TICKS": config.rest_windows * controller.window,
-        "MOVING_TICKS": config.moving_windows * controller.window,
-        "TIMEOUT": repr(config.settle_timeout_s),
+        "LOST_TICKS": LOST_TICKS,
+        "LATE_TICKS": LATE_TICKS,
+        "REST_TICKS": REST_WINDOWS * controller.window,
+        "MOVING_TICKS": MOVING_WINDOWS * controller.window,
+        "TIMEOUT": repr(SETTLE_TIMEOUT_S),
         "SEARCH": begin(policy, 1).size,
         "SEARCH_STEPS": N_STEPS,
         "THRESHOLD": repr(policy.reward.threshold),
@@ -93,15 +97,15 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "QUANTILE": repr(QUANTILE),
         "LEAST_LOAD": repr(LOWEST * most_kg),
         "GREATEST_LOAD": repr(HIGHEST * most_kg),
-        "LOAD_KNOWN": repr(config.load_known * most_kg),
-        "OVERLOAD": repr(config.overload * most_kg),
+        "LOAD_KNOWN": repr(KNOWN * most_kg),
+        "OVERLOAD": repr(OVERLOAD * most_kg),
         "JUMP": repr(JUMP * most_kg),
         "N_JUMPS": N_JUMPS,
         "N_AVERAGED": N_AVERAGED,
-        "LEAST_SHARE": repr(min(config.shares)),
-        "MAX_SHIFT": ", ".join(map(repr, config.shift_limit.tolist())),
-        "N_CORRECTIONS": config.n_corrections,
-        "CORRECTION_SHARE": repr(config.correction_share),
+        "LEAST_SHARE": repr(min(SHARES)),
+        "MAX_SHIFT": ", ".join(map(repr, SHIFT_LIMIT.tolist())),
+        "N_CORRECTIONS": N_CORRECTIONS,
+        "CORRECTION_SHARE": repr(CORRECTION_SHARE),
         "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),
     }
     # Fill the templates.

@@ -37,10 +37,9 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.loop import in_force, refusals, start, step, with_goal
-from mjx_softarm.deploy.safety import Event, Fault
+from mjx_softarm.deploy.safety import Event, Fault, stop_of
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.reach import nearest_poses
-from mjx_softarm.policy.reachable import nearest
+from mjx_softarm.policy.reach import nearest, nearest_poses
 from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.sensing.load import estimate_load
 
@@ -122,9 +121,9 @@ class Machine:
             self.state = in_force(self.state, vented(self._before_kpa, self.controller.dt_s))
         else:
             refused = self._take_goal(row[-6:], checked) if new_goal else ()
-            self.state, tick = step(self.controller, self.state, row[len(FLAGS) : -6], bool(late))
-            self.stopped = tick.stop is not None
-            events, arrived = refused + tick.events, tick.arrived
+            self.state, raised = step(self.controller, self.state, row[len(FLAGS) : -6], bool(late))
+            self.stopped = stop_of(raised) is not None
+            events, arrived = refused + raised, self.state.arrived
         # Collect the outputs.
         belief, command = self.state.belief, self.state.command
         spring_m, nothing = belief.spring_m, np.full_like(belief.spring_m, np.nan)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.controller import LOOP
-from mjx_softarm.deploy.safety import Fault
+from mjx_softarm.deploy.safety import MOVING_WINDOWS, REST_WINDOWS, Fault
 from mjx_softarm.export import computations
 from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.__main__ import main
@@ -31,12 +30,7 @@ def test_rows_meet_faults_and_vent(golden, controller):
     at_rest, in_motion = (
         lost - begins[np.searchsorted(begins, lost, "right") - 1] - 60
     )  # ticks after the leak
-    assert (
-        LOOP.rest_windows * controller.window
-        <= at_rest
-        < LOOP.moving_windows * controller.window
-        <= in_motion
-    )
+    assert REST_WINDOWS * controller.window <= at_rest < MOVING_WINDOWS * controller.window <= in_motion
     stopped = np.flatnonzero(faults & BITS[Fault.SENSOR_STUCK])[0]
     pressure_kpa = golden.outputs[stopped:, 2 : 2 + N]
     ramp = np.abs(pressure_kpa[: np.flatnonzero(golden.inputs[stopped + 1 :, 0])[0] + 1])

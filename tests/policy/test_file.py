@@ -19,8 +19,7 @@ from mjx_softarm.control import Gains, allocation
 from mjx_softarm.mdp.observation import OBS_LAYOUT, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
-from mjx_softarm.policy.actor import policy_from_actor
-from mjx_softarm.policy.file import load_policy, save_policy
+from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}

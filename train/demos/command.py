@@ -13,7 +13,7 @@ from rich.console import Console
 
 from mjx_softarm._support import cli
 from mjx_softarm.deploy.drivers import names
-from mjx_softarm.deploy.drivers.same_arm import check_number
+from mjx_softarm.deploy.drivers.names import check_number
 from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, save_log
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import TABLES, Log

@@ -14,11 +14,11 @@ import jax
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.deploy.drive import Drive, Hold
 from mjx_softarm.deploy.ending import Ending, vent_at_end
 from mjx_softarm.deploy.link import ArmFault, Recorder
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
 from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
 from train.demos.expert import Expert, ExpertError
 from train.demos.posture import Posture, PostureTarget
@@ -150,7 +150,7 @@ class WaypointRecorder:
         chamber = worst * (spec.n_chambers // spec.n_springs)  # beside the spring
         kpa = self._drive.link.pressure_kpa[chamber]
         return ArmFault(
-            f"{name}: got no rest, expected it within {LOOP.settle_timeout_s:g} s; spring {worst} is "
+            f"{name}: got no rest, expected it within {SETTLE_TIMEOUT_S:g} s; spring {worst} is "
             f"{1e3 * off_m[worst]:+.1f} mm off, its chamber at {kpa:.1f} kPa"
         )
 

@@ -18,7 +18,7 @@ from calib.arm import CalibratedArm
 from calib.fit import payload
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
-from mjx_softarm.policy.networks import ArmModel, take_networks
+from mjx_softarm.policy.file import ArmModel, take_networks
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 from train.runs import estimator

@@ -43,8 +43,14 @@ from mjx_softarm.mdp.observation import (
     rate_ticks,
 )
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.policy.actor import actor_layers, policy_from_actor
-from mjx_softarm.policy.file import Policy, action_layout, load_policy, save_policy
+from mjx_softarm.policy.file import (
+    Policy,
+    action_layout,
+    actor_layers,
+    load_policy,
+    policy_from_actor,
+    save_policy,
+)
 from mjx_softarm.spec import ArmSpec
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run

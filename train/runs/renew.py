@@ -9,7 +9,7 @@ from rich.console import Console
 
 from calib.arm import CalibratedArm
 from calib.changes import MIN_TIP_MM
-from mjx_softarm.deploy.controller import LOOP
+from mjx_softarm.mdp.actions import SHIFT_LIMIT
 from train.agent.registry import LEARNERS, name_of
 from train.runs import run as runs
 from train.runs.checkpoint import RunError
@@ -82,6 +82,6 @@ def _errors_mm(run: Run) -> dict[str, float]:
     """Return errors of a policy in simulation, with corrected goals at rest."""
     evaluate = runs.task_of_run(run).evaluate
     if not run.config.env.moves:  # the loop corrects the last references of policies of motion instead
-        evaluate = evaluate.on(evaluate.env, shift_limit=LOOP.shift_limit)
+        evaluate = evaluate.on(evaluate.env, shift_limit=SHIFT_LIMIT)
     figures = evaluate(run.policy())[0].to_dict()
     return {name: figures[key] for name, key in ERRORS.items() if key in figures}

@@ -22,7 +22,8 @@ from mjx_softarm._support.errors import needing
 from mjx_softarm.deploy.capture.system import CaptureFrame, CaptureName, check_names
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 
-COMMAND_PORT, DATA_PORT = 1510, 1511
+COMMAND_PORT = 1510
+DATA_PORT = 1511
 WAIT_S = 2.0  # longest wait for the server's answer, for its descriptions, and for the first frame
 AGAIN_S = 1.0  # time without a frame after which the server is asked again; it may have begun anew
 MOST = 20  # number of packets that one poll reads at most, so that a flood does not hold up the loop
@@ -59,21 +60,25 @@ class NatNet:
             raise TimeoutError(f"got {what} from {name.host}, expected Motive to stream")
 
         # Bodies and markers, as the server describes them
-        described, where = self._described, f"--capture natnet:{name.host}"
-        sets = {found.name: len(found.marker_names) for found in described.marker_sets}
+        described = self._described
+        where = f"--capture natnet:{name.host}"
+        sets = {one.name: len(one.marker_names) for one in described.marker_sets}
         for body in (name.body, name.base):
-            check_names(where, "body", body, sorted(found.name for found in described.rigid_bodies))
+            check_names(where, "body", body, sorted(one.name for one in described.rigid_bodies))
         check_names(where, "marker set", name.markers, sorted(sets))
         self._n_markers = sets.get(name.markers, 0)
 
     def poll(self) -> CaptureFrame | None:
         """Return the newest frame since the last call, None without one, at once; see `Source`."""
         self._read()
-        frame, now_s = self._new[-1] if self._new else None, time.monotonic()
+        frame = self._new[-1] if self._new else None
+        now_s = time.monotonic()
         self._new.clear()
         # After a while without a frame the server may have begun anew, and its bodies have other numbers.
         if now_s - self._asked_s > AGAIN_S:
-            self._asked_s, self._described, self._first = now_s, None, None
+            self._asked_s = now_s
+            self._described = None
+            self._first = None
             self._client.send_request(self._client.NAT_CONNECT)
             self._client.request_modeldef()
         if frame is None or self._described is None:
@@ -86,7 +91,7 @@ class NatNet:
 
     def _connect(self, multicast: bool) -> Any:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect((self._host, COMMAND_PORT))  # sends nothing; tells which of our addresses it is
+            probe.connect((self._host, COMMAND_PORT))  # sends nothing; shows which of our addresses is used
             local = probe.getsockname()[0]
         client = self._package.NatNetClient(
             self._host, local, command_port=COMMAND_PORT, data_port=DATA_PORT, use_multicast=multicast
@@ -143,9 +148,9 @@ class NatNet:
             if body.id_num in names and body.tracking_valid is not False  # None before NatNet 2.6
         }
         marker_m = np.full((self._n_markers, 3), np.nan)
-        for found in frame.marker_sets:
-            if found.model_name == self._name.markers and len(found.marker_pos_list) == self._n_markers:
-                marker_m = np.array(found.marker_pos_list).reshape(-1, 3)
+        for one in frame.marker_sets:
+            if one.model_name == self._name.markers and len(one.marker_pos_list) == self._n_markers:
+                marker_m = np.array(one.marker_pos_list).reshape(-1, 3)
         marker_m[(marker_m == 0.0).all(axis=1)] = np.nan  # a hidden marker stands at the origin
         return CaptureFrame(frame.suffix.timestamp, self._latency(frame.suffix), bodies, marker_m)
 

@@ -10,7 +10,7 @@ from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.payload import told_payload
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import TOLERANCE_M, Gains, saturated
-from mjx_softarm.deploy.belief import as_without
+from mjx_softarm.deploy.belief import explained_by_pressure_loss
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
@@ -112,7 +112,7 @@ def found(distilled, end, commanded_kpa, reference_m):
     spring_m = end.spring_m + 4e-5 * np.random.default_rng(9).standard_normal(end.spring_m.shape)
     suspect = saturated(commanded_kpa, reference_m, spring_m, Gains.from_spec(SPEC), TOLERANCE_M)
     rows = zip(commanded_kpa, spring_m, strict=True)
-    return suspect & np.array([as_without(distilled.spring_model, *row) for row in rows])
+    return suspect & np.array([explained_by_pressure_loss(distilled.spring_model, *row) for row in rows])
 
 
 @pytest.mark.parametrize("payload_kg", [0.0, 1.0])

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from calib.arm import CalibratedArm
 from mjx_softarm import ArmSpec
-from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.env import EnvConfig
+from mjx_softarm.mdp.actions import SHIFT_LIMIT
 from tests.train.small import CONFIG, SHORT
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run
@@ -72,7 +72,7 @@ def test_goals_are_corrected_at_rest_alone(moves, run_of, monkeypatch, capsys):
     then, limits = run_of("tqc", "payload"), []
     monkeypatch.setattr(EnvConfig, "moves", moves)
     told(then, THEN, THEN, monkeypatch, capsys, limits=limits)
-    assert len(limits) == (0 if moves else 2) and all(np.array_equal(x, LOOP.shift_limit) for x in limits)
+    assert len(limits) == (0 if moves else 2) and all(np.array_equal(x, SHIFT_LIMIT) for x in limits)
 
 
 def told(then, old, new, monkeypatch, capsys, limits=None, later=None):

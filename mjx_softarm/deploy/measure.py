@@ -15,8 +15,8 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import Arrival, LoopRun
 from mjx_softarm.deploy.safety import Fault
+from mjx_softarm.deploy.session import Arrival, LoopRun
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
@@ -85,10 +85,10 @@ def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
     chosen = np.zeros(1, int)
     for n_cells in range(1, n + 1):  # along the longest side
         size = (high - low).max() / n_cells + 1e-6
-        at = (workspace[:, :3] - low) / size
-        away = np.linalg.norm(at - np.floor(at) - 0.5, axis=1)
+        cell = (workspace[:, :3] - low) / size
+        away = np.linalg.norm(cell - np.floor(cell) - 0.5, axis=1)
         order = np.argsort(away)
-        _, first = np.unique(np.floor(at[order]), axis=0, return_index=True)
+        _, first = np.unique(np.floor(cell[order]), axis=0, return_index=True)
         if len(first) > n:
             break
         chosen = order[first]
@@ -106,7 +106,8 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy
     mask = np.zeros((len(goals), policy.spec.n_chambers), bool)
     arrival_s, load_estimate_g = np.full((2, len(goals)), np.nan)
     for arrival in run.arrivals:
-        point, rest = arrival.index, at_rest(run, controller, arrival)
+        point = arrival.index
+        rest = at_rest(run, controller, arrival)
         error[point], mask[point], load_estimate_g[point] = rest.error, rest.saturated, 1e3 * rest.load_kg
         believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
         arrival_s[point] = run.log.time_s[arrival.row]
@@ -129,14 +130,16 @@ def at_rest(run: LoopRun, controller: Controller, arrival: Arrival) -> Rest:
     Raises:
         InputError: motion capture saw nothing, or no tick was logged.
     """
-    log, policy = run.log, controller.policy
+    log = run.log
+    policy = controller.policy
     if log.tip_m is None or log.tip_quaternion is None:
         raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
     assert log.pressure_kpa is not None and log.reference_m is not None
     assert log.readings is not None and log.load_kg is not None
     rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
     spring_m = _finite_mean(policy.sensor.lengths(log.readings[rows], np.nan).length_m)
-    reference_m, law = log.reference_m[arrival.row], policy.gains.measured()
+    reference_m = log.reference_m[arrival.row]
+    law = policy.gains.measured()
     mean_kpa = _finite_mean(log.pressure_kpa[rows])
     return Rest(
         seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal),
@@ -235,7 +238,8 @@ def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
     # The lag is the one by which the tip's way fits the goal's best.
     lags = range(min(round(MOST_LAG_S / dt_s), max(len(goal) for _, goal in ways) - 1) + 1)
     means = [float(np.nanmean(away_mm(lag))) for lag in lags]
-    best, now = int(np.argmin(means)), away_mm(0)
+    best = int(np.argmin(means))
+    now = away_mm(0)
     return {
         "way_mm": means[0],
         "way_95_mm": float(np.nanquantile(now, 0.95)),
@@ -247,7 +251,7 @@ def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
 
 
 def write_accuracy(
-    folder: Path, accuracy: Accuracy, found: Mapping[str, Any], ways: Sequence[Way] = ()
+    folder: Path, accuracy: Accuracy, numbers: Mapping[str, Any], ways: Sequence[Way] = ()
 ) -> str:
     """Write `accuracy.json` and, with matplotlib, `accuracy.png`; return why there is no picture, or "".
 
@@ -261,8 +265,8 @@ def write_accuracy(
         {"goal": goal.tolist(), "error": error.tolist() if np.isfinite(error).all() else None}
         for goal, error in zip(accuracy.goal, accuracy.error, strict=True)
     ]
-    numbers = {name: None if value != value else value for name, value in found.items()}
-    text = json.dumps({**numbers, "at": points}, indent=2, allow_nan=False)
+    finite = {name: None if value != value else value for name, value in numbers.items()}
+    text = json.dumps({**finite, "at": points}, indent=2, allow_nan=False)
     (folder / "accuracy.json").write_text(f"{text}\n", "utf-8")
 
     # Goals and tips from above and from the side; shares of the goals, or of the time, below an error
@@ -272,10 +276,14 @@ def write_accuracy(
         return "no picture: matplotlib is not installed"
     figure = Figure(figsize=(10, 4), layout="constrained")
     above, side, shares = figure.subplots(1, 3)
-    seen, style, of_what = accuracy.goal[:, :3] + accuracy.error[:, :3], ".", "goals"
+    seen = accuracy.goal[:, :3] + accuracy.error[:, :3]
+    style = "."
+    of_what = "goals"
     off = accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3]
     if ways:
-        seen, style, of_what = np.concatenate([tip for tip, _ in ways]), "-", "time"
+        seen = np.concatenate([tip for tip, _ in ways])
+        style = "-"
+        of_what = "time"
         off = seen - np.concatenate([goal for _, goal in ways])
     for axes, (i, j) in ((above, (0, 1)), (side, (0, 2))):
         axes.plot(accuracy.goal[:, i], accuracy.goal[:, j], "o", mfc="none", label="goal")
@@ -288,3 +296,51 @@ def write_accuracy(
     shares.set(xlabel="translation error [mm]", ylabel=f"share of the {of_what} below", ylim=(0, 1), xlim=0)
     figure.savefig(folder / "accuracy.png", dpi=150)
     return ""
+
+
+def print_run(run: LoopRun, policy: Policy) -> None:
+    """Print faults, times and reached goals of a run, and the reason for a missed goal."""
+    for fault, count in run.counts().items():
+        print(f"fault: {fault.value}: {count} times, {fault.response.value}")
+    if len(run.latency_s):
+        median, high = 1e3 * np.quantile(run.latency_s, (0.5, 0.999))
+        n = len(run.latency_s)
+        print(f"from readings to pressures: median {median:.2f} ms, 99.9 % {high:.2f} ms of {n} ticks")
+    reached = f"{sum(arrival.reached for arrival in run.arrivals)} of {run.n_goals} goals reached"
+    print(f"{reached}; the arm is {'' if run.ending.vented else 'NOT '}vented")
+
+    # The error that a goal allows, and a reason for more
+    if all(arrival.reached for arrival in run.arrivals):
+        return
+    reward = policy.reward
+    for largest, unit, other in (
+        (max(reward.weights[:3]), "mm", "rotation"),
+        (max(reward.weights[3:]), "deg", "position"),
+    ):
+        if largest:
+            within = f"{reward.threshold / largest:.2g} {unit}"
+            print(f"a goal counts as reached within {within} if the {other} is exact")
+    if not policy.calibrated:
+        print(
+            "the policy is not calibrated: it is expected to miss on an arm that differs from its "
+            "specification; record a log, run `python -m calib run`, train and export (docs/your-arm.md)"
+        )
+
+
+def print_figures(numbers: dict[str, Any]) -> None:
+    """Print the figures of an accuracy."""
+    for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
+        mean = numbers[f"{name}_{unit}"]
+        high = numbers[f"{name}_95_{unit}"]
+        most = numbers[most]
+        if np.isnan(mean):  # goals do not ask for it
+            continue
+        print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
+    if "way_s" in numbers:
+        print(
+            f"on the way, {numbers['way_s']:.0f} s [mm]: mean {numbers['way_mm']:.2f}, 95 % below "
+            f"{numbers['way_95_mm']:.2f}, at most {numbers['way_max_mm']:.2f}; "
+            f"{numbers['lag_s']:.2f} s behind, without that {numbers['way_without_lag_mm']:.2f}"
+        )
+    measured = f"{numbers['measured']} of {numbers['points']} goals measured"
+    print(f"{measured}, {numbers['saturated_points']} with a saturated chamber")
