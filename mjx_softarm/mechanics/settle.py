@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -109,12 +109,12 @@ def settle(params: ArmParams, reference_m: Array, n_at_once: int | None = None) 
         reference_m (n_springs,): spring lengths that the law tracks.
         n_at_once: arms of a `jax.vmap` that settle at once, from `arms_at_once`; None is all of them.
     """
-    return _solver(1, n_at_once)(params, reference_m)[0]
+    return _solver(1, n_at_once)(reference_m, params)[0]
 
 
 def _settle_jvp(n_at_once: int | None, primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
     # A second small step brings the response, which is that before the last step, up to date
-    settled, equilibrium = _solver(2, n_at_once)(*primals)
+    settled, equilibrium = _solver(2, n_at_once)(*reversed(primals))
     with jax.default_matmul_precision("highest"):
         tangent = equilibrium_tangents(primals, tangents, equilibrium, settled.settled)
     none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in settled))
@@ -137,34 +137,10 @@ def settle_pressures(params: ArmParams, pressure_kpa: Array, n_at_once: int | No
 @functools.cache
 def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
     """Return `_solve` for one arm; `jax.vmap` of it puts the arms last, in chunks of `n_at_once`."""
-    solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
-
-    def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
-        if n_at_once and n_at_once < n:
-            solutions = xla.in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
-        else:
-            solutions = _solve_arms_last(n_small, n, batched, *arguments)
-        return solutions, jax.tree.map(lambda _: True, solutions)
-
-    solve.def_vmap(many)
-    return solve
+    return xla.rows_last(functools.partial(_solve, n_small), n_at_once, n_shared=1)
 
 
-def _solve_arms_last(
-    n_small: int, n: int, batched: list[Any], params: ArmParams, reference_m: Array
-) -> _Solution:
-    """Return the solutions of n arms; `batched` is true for arrays that have the arms as first axis."""
-
-    def arms_last(x: Any, is_batched: bool) -> Array:
-        return jnp.moveaxis(x, 0, -1) if is_batched else jnp.asarray(x)[..., None]
-
-    params_batched, reference_batched = batched
-    reference_m = jnp.broadcast_to(arms_last(reference_m, reference_batched), (reference_m.shape[-1], n))
-    solutions = _solve(n_small, jax.tree.map(arms_last, params, params_batched), reference_m)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solutions)
-
-
-def _solve(n_small: int, params: ArmParams, reference_m: Array) -> _Solution:
+def _solve(n_small: int, reference_m: Array, params: ArmParams) -> _Solution:
     """Return the equilibrium after `n_small` small steps and all that its derivative needs; arms are last."""
     # Start: the straight arm, its pressures as close to zero as the limits allow
     dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
