@@ -68,7 +68,7 @@ def calibrate(
 
     Raises:
         LogError: the logs are of different arms.
-        FitError: the logs do not allow a fit.
+        InputError: the logs do not allow a fit.
     """
     later = [log for log in logs if log.goal is not None]
     if 0 < len(later) < len(logs):

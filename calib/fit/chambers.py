@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import N_KINDS, Measured, error_groups, simulate, tip_changes
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal, refine
@@ -29,6 +28,7 @@ from calib.fit.parameters import by_name, half_widths, names, priors, spec_at, t
 from calib.fit.pose_errors import PoseErrors, errors_of
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.spec import ArmSpec
 
 MIN_POSES = 20
@@ -156,7 +156,7 @@ def _section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[
     """Return the markers at the sections' ends, NaN where they are not to be used, and why not."""
     try:
         return section_ends(poses, spec), ()
-    except FitError as error:  # the fit goes without them
+    except InputError as error:  # the fit goes without them
         return np.full((poses.n, spec.structure.n_sections, 3), np.nan), (str(error),)
 
 
