@@ -16,6 +16,7 @@ import numpy as np
 from calib.arm import CalibratedArm
 from calib.changes import MIN_POSES as MIN_LATER
 from calib.changes import fit_changes
+from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
@@ -24,7 +25,8 @@ from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
 from calib.fit.payload import LEAST_WEIGHT, MIN_WEIGHED, held_at, payload_poses, told_widths, weighed
-from calib.fit.s2r import fit_s2r, simulate_poses
+from calib.fit.pose_errors import PoseErrors, pose_errors
+from calib.fit.s2r import SimulatedPoses, fit_printed, fit_s2r, moved, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
@@ -129,32 +131,31 @@ def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     return StepResult(fit.spec if fit.is_better else spec, motion.damping(fit, shape))
 
 
-def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
-    """Fit the sim-to-real network, and the pressures that hold the arm, to poses of the unloaded arm."""
-    # Settle the simulated arm at the spring lengths of these poses; with a payload its poses would differ.
-    poses = measurements.poses.with_lengths(spec)
-    used = _unloaded(poses, spec)
-    simulated = simulate_poses(spec, poses.spring_m[used]) if len(used) else None
-    n_settled = 0 if simulated is None else int(np.count_nonzero(simulated.valid))
-    n_unsettled = len(used) - n_settled
-    if simulated is None or n_settled < MIN_S2R_POSES:
+def s2r(measurements: Measurements, spec: ArmSpec, seed: int, printed: bool = False) -> StepResult:
+    """Fit the sim-to-real network, and the pressures that hold the arm, to poses of the unloaded arm.
+
+    With `printed` the network is the paper's, and the section shows the process beside it.
+    """
+    found = _settled_poses(measurements, spec)
+    if len(found.rows) < MIN_S2R_POSES:
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
-        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": n_unsettled}
-        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, uses)}"
+        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": found.n_unsettled}
+        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, len(found.rows), uses)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
         return StepResult(spec, Section("Sim-to-real network", needed, warnings=(remedy,)))
-    used, settled = used[simulated.valid], simulated.take(simulated.valid)
-    real = pose_from_frame(poses.tip_m[used], poses.tip_rotation[used])
+    poses, rows, settled, real, n_unsettled = found
     # Fit the network from simulated to measured tips.
     fit = fit_s2r(spec, settled, real, seed)
-    section = sections.s2r(fit, settled.pose, settled.spring_m, real, n_unsettled)
+    others = (fit,) if printed else ()
+    fit = fit_s2r(spec, settled, real, seed, printed=True) if printed else fit
+    section = sections.s2r(fit, settled.pose, settled.spring_m, real, n_unsettled, others)
     corrected, away = (f(fit.s2r, settled.pose, settled.spring_m) for f in (correct, extrapolation))
     pairs = {
         "simulated": PosePairs(real, settled.pose, np.zeros(len(real), bool)),
         "with the network": PosePairs(real, corrected, away > 1.0),
     }
     # Fit the pressures that hold the arm.
-    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
+    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[rows], settled.pressure_kpa, seed)
     extras = Extras(pairs=pairs)
     if fit.is_better:
         extras["s2r"] = fit.s2r
@@ -167,6 +168,51 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     widths_kg = told_widths(held.held, at, largest_kg)
     section = sections.with_pressures(section, held, widths_kg, KNOWN * largest_kg)
     return StepResult(spec, section, extras)
+
+
+def s2r_errors(measurements: Measurements, arm: CalibratedArm, seed: int = 0) -> dict[str, PoseErrors]:
+    """Return errors of tips at the held-out poses of a calibration's network.
+
+    Args:
+        measurements: measurements of the calibration.
+        arm: calibrated arm, with its network.
+        seed: seed of the calibration.
+
+    Returns:
+        Errors of the simulated arm, of the paper's network fitted to the other poses, and of the arm's S2R.
+    """
+    _, _, settled, real, _ = _settled_poses(measurements, arm.spec)
+    held_out = held_out_blocks(len(real), block=block_rows(len(real)), seed=seed)
+    judged = settled.take(held_out)
+    printed = fit_printed(settled.take(~held_out), real[~held_out], seed)
+    poses = {"simulated": judged.pose, "as printed": moved(judged.pose, printed(judged))}
+    if arm.s2r is not None:
+        poses["calibrated"] = correct(arm.s2r, judged.pose, judged.spring_m)
+    return {name: pose_errors(np.asarray(pose, float), real[held_out]) for name, pose in poses.items()}
+
+
+class _SettledPoses(NamedTuple):
+    """Poses of the unloaded arm at whose spring lengths the simulated arm finds rest."""
+
+    poses: StaticPoses  # all static poses
+    rows: np.ndarray  # (n,) indices of the poses that settled
+    simulated: SimulatedPoses  # n poses
+    real: np.ndarray  # (n, 6) [mm, deg]
+    n_unsettled: int
+
+
+def _settled_poses(measurements: Measurements, spec: ArmSpec) -> _SettledPoses:
+    """Settle the simulated arm at the spring lengths of the unloaded arm; a payload would move the tip."""
+    poses = measurements.poses.with_lengths(spec)
+    rows = _unloaded(poses, spec)
+    # Without any pose, simulate one in vain: the arrays keep their shapes.
+    spring_m = poses.spring_m[rows] if len(rows) else np.ones((1, spec.n_springs))
+    simulated = simulate_poses(spec, spring_m)
+    settled = np.flatnonzero(simulated.valid[: len(rows)])
+    n_unsettled = len(rows) - len(settled)
+    rows = rows[settled]
+    real = pose_from_frame(poses.tip_m[rows], poses.tip_rotation[rows])
+    return _SettledPoses(poses, rows, simulated.take(settled), real, n_unsettled)
 
 
 def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:

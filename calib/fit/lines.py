@@ -282,7 +282,10 @@ def _with_widths(
     if not fit_share and k > 1:
         columns = zip(x.T[..., None], y.T[..., None], slope[:, None], offset[:, None], strict=True)
         each = [_with_widths(*column, share, start_share, False) for column in columns]
-        return _Lines(*(np.concatenate(values) for values in list(zip(*each, strict=True))[:5]), share, 0.0)
+        slope, offset, slope_width, offset_width, noise = (
+            np.concatenate(values) for values in list(zip(*each, strict=True))[:5]
+        )
+        return _Lines(slope, offset, slope_width, offset_width, noise, share, 0.0)
     # Standardise the columns; parameters are slopes, offsets and, if fitted, the share.
     wire, y_spread = np.where(np.isfinite(y), wire_length(x, share), np.nan), _spread(y)
     centre, spread = np.nanmean(wire, axis=0), _spread(wire)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -155,7 +156,14 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
     )
 
 
-def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Section:
+def s2r(
+    fit: S2RFit,
+    pose: np.ndarray,
+    spring_m: np.ndarray,
+    real: np.ndarray,
+    n_unsettled: int,
+    others: Sequence[S2RFit] = (),
+) -> Section:
     """Show distances of simulated to real poses, with and without the network.
 
     Args:
@@ -164,12 +172,22 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         spring_m (n, n_springs) [m]: their spring lengths.
         real (n, 6) [mm, deg]: measured poses.
         n_unsettled: number of other poses, at whose spring lengths the simulated arm did not settle.
+        others: fits to the same poses that were not chosen.
     """
     # The table of errors, and the histogram of the held-out ones.
     errors = _errors(
         ("held-out poses, simulated", fit.test_uncorrected),
         ("held-out poses, corrected", fit.test),
         ("poses of the fit, corrected", fit.in_sample),
+        (f"held-out poses, {fit.model}", fit.test_model),
+        *(
+            row
+            for other in others
+            for row in (
+                (f"held-out poses, {other.model}", other.test_model),
+                (f"held-out poses, network of the {other.model}", other.test),
+            )
+        ),
     )
     corrected = correct(fit.s2r, pose, spring_m)
     figure, axes = _figure()
@@ -187,7 +205,8 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (errors,),
         fit.warnings,
-        plain(fit, "s2r", "held_out") | {"n_unsettled": n_unsettled},
+        plain(fit, "s2r", "held_out")
+        | {"n_unsettled": n_unsettled, "others": [plain(other, "s2r", "held_out") for other in others]},
         (("held-out poses with and without the network", figure),),
     )
 
