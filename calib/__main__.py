@@ -126,7 +126,7 @@ def _run(
                 f"{option}: got --since {since}, whose springs and S2R stay, expected one of them"
             )
     known = load_calibration(since) if since else None
-    arm = known.spec if known else ArmSpec.of(spec)
+    arm = known.arm.spec if known else ArmSpec.of(spec)
     if not (spec or since):
         print(f"arm: {arm.name}, by default; --spec names another arm")
     read, findings = _read(logs, arm, strict)
@@ -143,7 +143,7 @@ def _run(
     lines = warning_lines(calibration.sections)
     lines += [f"note: {section.title}: {note}" for section in calibration.sections for note in section.notes]
     print("\n".join([*lines, f"report: {out / 'report.html'}"]))
-    if known and calibration.spec == known.spec and calibration.held is known.held:
+    if known and calibration.arm.spec == known.arm.spec and calibration.arm.held is known.arm.held:
         print(f"next: nothing to export; {since} stays the calibration of this arm")
     else:
         after = "train export RUN" if since else "train reach --preset analytic"

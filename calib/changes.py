@@ -20,12 +20,13 @@ import numpy as np
 from calib.arm import CalibratedArm
 from calib.fit.blocks import held_out_blocks
 from calib.fit.held_pressures import without_redundant_part
-from calib.fit.leastsquares import QUANTILE, Problem, Solution, fit, rms_of
+from calib.fit.leastsquares import Problem, Solution, fit, rms_of
 from calib.fit.pose_errors import PoseErrors, change_errors
 from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.sensing.held_pressures import held_kpa
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import correct, correction_between
 from mjx_softarm.spec import ArmSpec

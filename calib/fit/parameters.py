@@ -30,10 +30,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from calib.fit.leastsquares import QUANTILE
 from mjx_softarm._support.fields import scaled
 from mjx_softarm._support.small_matrices import product
 from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.sensing.pose import rotation_about, rotation_from_quaternion, rotation_vector
 from mjx_softarm.spec import BONDS, ArmSpec, Structure
 

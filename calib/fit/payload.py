@@ -17,7 +17,7 @@ lies up to some centimetres aside of the simulated one, which is a lever of a pa
 with 1 kg it helps three of them.
 
 What is left of e is a factor that is alike for all chambers and for poses that are alike. Poses with a known
-weight tell it (`weighed`).
+weight tell it (`fit_payload_scale`).
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float
     return QUANTILE / np.sqrt(information)
 
 
-def told_widths(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tuple[float, float]:
+def payload_intervals(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tuple[float, float]:
     """Return how well payloads are told over the workspace, as half-widths [kg] of 95 % intervals.
 
     Returns:
@@ -143,7 +143,7 @@ def told_widths(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tup
     return float(np.median(none)), float(np.quantile(largest, 0.95))
 
 
-def told_payload(
+def estimated_payload(
     arm: CalibratedArm, spring_m: np.ndarray, pressure_kpa: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return payloads (m,) [kg] of arms at rest, and half-widths (m,) of their 95 % intervals.
@@ -168,7 +168,7 @@ def told_payload(
     return payload_kg, QUANTILE * np.sqrt(variance)
 
 
-class Weighed(NamedTuple):
+class PayloadScaleFit(NamedTuple):
     """Factor of all payloads by poses with a known weight, and how well the weight itself was told."""
 
     ratio: float  # payload that was told, over the weight
@@ -182,7 +182,7 @@ class Weighed(NamedTuple):
         return abs(self.ratio - 1.0) < MOST_OFF
 
 
-def weighed(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> Weighed:
+def fit_payload_scale(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> PayloadScaleFit:
     """Fit the factor of payloads to poses with a known weight.
 
     Args:
@@ -197,14 +197,14 @@ def weighed(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> Weighed
     weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
     kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
     kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)[rows] - spec.unmodelled_kpa
-    told_kg, _ = told_payload(arm, spring_m, kpa)
+    told_kg, _ = estimated_payload(arm, spring_m, kpa)
     # Least squares for their ratio, with a prior: what a weight can tell of a factor's deviation
     information, prior = np.sum(weight_kg**2), COMMON_FACTOR**2 - LEFT_FACTOR**2
     ratio = np.sum(told_kg * weight_kg) / information
     variance = np.sum((told_kg - ratio * weight_kg) ** 2) / (len(rows) - 1) / information
     share = prior / (prior + variance)
     factor, sd = held.factor * (1.0 + share * (ratio - 1.0)), np.sqrt(share * variance + LEFT_FACTOR**2)
-    return Weighed(float(ratio), float(factor), float(sd), len(rows))
+    return PayloadScaleFit(float(ratio), float(factor), float(sd), len(rows))
 
 
 def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -> np.ndarray:

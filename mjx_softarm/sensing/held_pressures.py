@@ -16,7 +16,7 @@ corrects them. Its variance tells how well a payload is known: it is large far f
 A payload changes a chamber's pressure by the simulated change times a factor. The log of an unloaded arm does
 not show this factor: with all stiffnesses, areas and masses greater by the same share, the log is the same.
 So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`, or about
-what poses with a known weight have told (`calib.fit.payload.weighed`).
+what poses with a known weight have told (`calib.fit.payload.fit_payload_scale`).
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
