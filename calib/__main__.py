@@ -97,7 +97,7 @@ def _run(
 
     Args:
         out: folder to write
-        since: calibration that goes on: the logs are later ones, and tell what has changed and how payloads
+        since: calibration that goes on: the logs are later ones, and show what has changed and how payloads
             are felt, nothing else
         shared_springs: fit one beta and one delta for all springs
         fit_compensation: fit the circuit's compensation inductance, too
@@ -136,8 +136,10 @@ def _run(
         steps.springs, shared=shared_springs, fit_compensation=fit_compensation
     )
     chosen["sim-to-real network"] = functools.partial(steps.s2r, printed=s2r == "printed")
-    tell = functools.partial(print, flush=True)
-    calibration = go_on(known, read, seed, tell) if known else calibrate(read, arm, seed, chosen, tell)
+    progress = functools.partial(print, flush=True)
+    calibration = (
+        go_on(known, read, seed, progress) if known else calibrate(read, arm, seed, chosen, progress)
+    )
     # Write the folder, and print the reasons not to trust it.
     write_calibration(out, calibration, [str(finding) for finding in findings], provenance("calib"))
     lines = warning_lines(calibration.sections)

@@ -76,7 +76,7 @@ def go_on(
 ) -> Calibration:
     """Return a calibration that goes on with later logs; arguments as of `calibrate`.
 
-    Poses without a payload tell what has changed, poses with a known weight how strongly payloads are felt.
+    Poses without a payload show what has changed, poses with a known weight how strongly payloads are felt.
 
     Raises:
         LogError: the logs are of different arms.

@@ -342,7 +342,7 @@ def _warnings(fit: LineFit, wire: np.ndarray, name: str) -> tuple[str, ...]:
         reasons = {
             f"got {n} rows, expected {MIN_ROWS} or more: measure more": n < MIN_ROWS,
             f"lengths spread by {range_y:.3g} only, noise being {noise:.3g}, so slope and offset can hardly "
-            "be told apart: measure over the whole range": range_y < 5 * noise,
+            "be separated: measure over the whole range": range_y < 5 * noise,
             f"held-out error {held_out:.3g} extrapolates in {100 * fit.beyond[k]:.0f} % of rows: measure the "
             "shortest and the longest lengths more than once, at different times": fit.beyond[k] > MAX_BEYOND,
             f"held-out error {held_out:.3g}, on its own rows {rms:.3g}: measure more rows, in random order": (

@@ -63,7 +63,7 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
 
     A state holds spring lengths in quarters of the section's length, the vertical in the section's axes, and
     the moment of the weights below, in units of the whole arm's weight half the section's length aside. More
-    than three springs, which tell no more than three, weigh as much as three.
+    than three springs, which measure no more than three do, weigh as much as three.
 
     Args:
         frames: plates and joints of the arm at rest.

@@ -31,7 +31,7 @@ class Plausible(NamedTuple):
 
 
 # A column whose median is outside has the wrong unit, or is another column; a row with a value outside is
-# dropped. The bounds tell mm from cm and m for such an arm, and Pa from kPa and bar. They cannot tell psi
+# dropped. The bounds distinguish mm from cm and m for such an arm, and Pa from kPa and bar. They cannot distinguish psi
 # from kPa, rad from deg, or one chamber from another.
 PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
     {

@@ -228,7 +228,7 @@ def with_pressures(
     Args:
         section: section of the network.
         held: fitted residual pressures.
-        widths_kg: how well payloads are told, see `calib.fit.payload.payload_intervals`.
+        widths_kg: accuracy of payloads, see `calib.fit.payload.payload_intervals`.
         known_kg: half-width beyond which the control loop does not believe a payload.
     """
     text = (
@@ -239,18 +239,18 @@ def with_pressures(
     )
     figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
     figures["hysteresis"] = float(held.held.hysteresis_kpa.max())
-    # Tell how well payloads will be known.
+    # The accuracy of payloads.
     none_g, largest_g = (1e3 * kg for kg in widths_kg)
     text += (
-        f" So the loop will tell within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
+        f" So the loop will know within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
         f"the workspace's poses, and the largest payload within {largest_g:.0f} g at 95 % of them."
     )
     widths = {"none, median": none_g, "largest, p95": largest_g}
     data = {"held_pressures_rms_kpa": figures, "payload_half_width_g": widths}
     warnings = section.warnings
     if largest_g > 1e3 * known_kg:
-        told = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
-        warnings += (f"{told}: record more random poses",)
+        accuracy = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
+        warnings += (f"{accuracy}: record more random poses",)
     return dataclasses.replace(section, text=section.text + text, warnings=warnings, data=section.data | data)
 
 
@@ -375,7 +375,7 @@ def changes(found: Changes, known_mm: float) -> Section:
     return Section(
         CHANGES,
         f"{found.n} later poses of the unloaded arm against the calibrated simulation. Zeros are true "
-        "lengths minus lengths read. A stiffness is told from an offset of the pressures to some per cent. "
+        "lengths minus lengths read. A stiffness is distinguished from an offset of the pressures to some per cent. "
         "Intervals are 95 %; contiguous blocks of poses are held out.",
         tables,
         warnings,
@@ -386,19 +386,21 @@ def changes(found: Changes, known_mm: float) -> Section:
 
 def payloads(found: PayloadScaleFit) -> Section:
     """Show how strongly the arm feels payloads, by poses with a known weight."""
-    told = f"{found.n} poses with a known weight were told as {found.ratio:.3f} of it in the mean"
+    estimate = f"{found.n} poses with a known weight gave {found.ratio:.3f} of it in the mean"
     if not found.is_plausible:
         expected = f"expected {1.0 - MOST_OFF:.1f} to {1.0 + MOST_OFF:.1f}"
         remedy = "check the weight and its unit, and whether the arm has changed since the calibration"
-        warning = f"{told}, {expected}: {remedy}"
-        return Section(PAYLOADS, f"{told}.", warnings=(warning,), data=found._asdict())
+        warning = f"{estimate}, {expected}: {remedy}"
+        return Section(PAYLOADS, f"{estimate}.", warnings=(warning,), data=found._asdict())
     percent = 100.0 * QUANTILE * found.factor_sd
     text = (
-        f"{told}. So a payload changes the pressures by {found.factor:.3f} of the simulated change. Near "
+        f"{estimate}. So a payload changes the pressures by {found.factor:.3f} of the simulated change. Near "
         f"these poses this factor is known to {percent:.0f} % (95 %); other errors add to it."
     )
     off = 100.0 * (found.ratio - 1.0)
-    note = f"payloads were told {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
+    note = (
+        f"payloads were estimated {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
+    )
     return Section(PAYLOADS, text, data=found._asdict(), notes=(note,))
 
 

@@ -138,7 +138,7 @@ def test_a_known_weight_tells_how_payloads_are_felt(demo, calibrated, tmp_path, 
     assert found.spec == arm.spec
     if not why:
         assert found.held.factor == pytest.approx(0.9, abs=0.03) and found.held.factor_sd < 0.04
-        assert "note: Payloads: payloads were told 1" in said.out and "% too light" in said.out
+        assert "note: Payloads: payloads were estimated 1" in said.out and "% too light" in said.out
         assert "next: python -m train export RUN --calibration" in said.out
     else:
         assert found.held.factor == 1.0 and status == 1 and why in said.out

@@ -107,7 +107,7 @@ def test_says_why_not_to_trust():
     rng = np.random.default_rng(0)
     x = 1.0 + 1e-3 * rng.standard_normal((30, 1))
     reasons = " ".join(fit_line(x, x + 1e-3 * rng.standard_normal((30, 1))).warnings)
-    assert "spring0: got 30 rows" in reasons and "hardly be told apart" in reasons
+    assert "spring0: got 30 rows" in reasons and "hardly be separated" in reasons
 
 
 def test_refuses():
