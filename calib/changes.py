@@ -4,7 +4,7 @@ The calibrated simulation settles at the lengths that the springs read at later 
 S2R corrects its tip. Where zeros have shifted, the measured tip lies elsewhere, and other pressures hold the
 arm. Where chambers are softer, less pressure holds it. Robust least squares with a prior fit both to both
 (`calib.fit.leastsquares`), beside offsets of the pressures, since a calibration does not know these exactly.
-Poses of one circle are alike, so softer chambers are distinguished from offsets to some per cent only. The fitted
+Poses of one circle are alike, so softer chambers differ from offsets to some per cent only. The fitted
 pressures are those of the later poses in either case, and with them the estimate of payloads there.
 
 Some poses take no part in a first fit and judge it. Changes that do not bring their tips closer, or their

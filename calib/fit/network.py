@@ -1,8 +1,8 @@
 """Small network fitted to rows of a log, or to a process that was fitted to them; bounded, stopped early.
 
 A linear map is fitted first, and a network learns its residual. Both are joined to one network, which is
-stored and run as one. Its inputs and outputs stay within the range of the rows, and anchors measure how far an
-input is from all rows.
+stored and run as one. Its inputs and outputs stay within the range of the rows, and anchors measure how far
+an input is from all rows.
 """
 
 from __future__ import annotations

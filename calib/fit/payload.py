@@ -13,8 +13,8 @@ of virtual work, chambers of effective areas A that lift a payload at the height
 
 So where the sim-to-real network raises the simulated tip by h, e grows by g (dh / dc) / A. A real arm's tip
 lies up to some centimetres aside of the simulated one, which is a lever of a payload. At random poses of rods
-100 to 104, 500 g are estimated with RMS errors of 23 to 47 g; without this part of e, 26 to 61 g. On the circle
-with 1 kg it helps three of them.
+100 to 104, 500 g are estimated with RMS errors of 23 to 47 g; without this part of e, 26 to 61 g. On the
+circle with 1 kg it helps three of them.
 
 What is left of e is a factor that is alike for all chambers and for poses that are alike. Poses with a known
 weight show it (`fit_payload_scale`).
@@ -57,7 +57,8 @@ N_POSES, SEED = 400, 1  # poses over the workspace, and their seed
 MIN_WEIGHED, LEAST_WEIGHT = 8, 0.25
 MOST_OFF = 0.3  # six standard deviations of a factor
 # Standard deviation of a fitted factor at poses like those of the fit. On the circle of rods 100 to 104,
-# which no experiment uses, 500 g give the factor of 1 kg to 0.007. Factors of random poses are off there by 0.037.
+# which no experiment uses, 500 g give the factor of 1 kg to 0.007. Factors of random poses are off there by
+# 0.037.
 LEFT_FACTOR = 0.02
 
 

@@ -375,7 +375,7 @@ def changes(found: Changes, known_mm: float) -> Section:
     return Section(
         CHANGES,
         f"{found.n} later poses of the unloaded arm against the calibrated simulation. Zeros are true "
-        "lengths minus lengths read. A stiffness is distinguished from an offset of the pressures to some per cent. "
+        "lengths minus lengths read. A stiffness and an offset of the pressures differ to some per cent. "
         "Intervals are 95 %; contiguous blocks of poses are held out.",
         tables,
         warnings,
