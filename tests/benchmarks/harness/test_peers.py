@@ -30,16 +30,9 @@ def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here
     assert requirements == pins | {shared: metadata.version(shared) for shared in SHARED}
 
 
-def test_an_environment_is_made_once_and_each_peer_has_its_own(made, tmp_path):
+def test_an_environment_is_made_once_and_anew_for_a_changed_pin_or_python(made, monkeypatch, tmp_path):
     first = peer_python("sbx", tmp_path)
-    assert first == tmp_path / ".venv-sbx" / "bin" / "python"
-    assert peer_python("sbx", tmp_path) == first and len(made) == 1
-    assert peer_python("sb3-contrib", tmp_path).parents[1] == tmp_path / ".venv-sb3-contrib"
-    assert made == [peer_packages("sbx"), peer_packages("sb3-contrib")]
-
-
-def test_a_changed_pin_or_another_python_makes_it_anew(made, monkeypatch, tmp_path):
-    peer_python("sbx", tmp_path)
+    assert peer_python("sbx", tmp_path) == first == tmp_path / ".venv-sbx/bin/python"
     monkeypatch.setitem(PINS, "sbx", ("sbx-rl==0.0.1",))
     peer_python("sbx", tmp_path)
     marker = tmp_path / ".venv-sbx" / MARKER

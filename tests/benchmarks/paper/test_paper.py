@@ -2,14 +2,13 @@
 
 import dataclasses
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.harness.stages import load_arrays, save_arrays
-from benchmarks.paper import experiments, jobs, pictures, report
+from benchmarks.paper import jobs, pictures, report
 from benchmarks.paper.experiments import stages
 from benchmarks.paper.trial import WAY, TrialOutcome
 from benchmarks.paper.trials import (
@@ -27,7 +26,6 @@ from mjx_softarm._support import cli
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.spec import ARM_FILE
 from tests.benchmarks.paper.made_up import make_policy
@@ -117,20 +115,6 @@ def test_a_run_that_lacks_its_checkpoint_or_config_starts_anew(tmp_path, ask):
     (run / "checkpoints/0").mkdir(parents=True)
     (run / "config.json").touch()
     assert ask(jobs.imitate, tmp_path, TINY, "pipe", 1, 2).resume == run
-
-
-def test_a_scene_is_the_twin_in_its_pipe_with_the_goals_of_its_task(tmp_path, make_arm_model, monkeypatch):
-    shown = SimpleNamespace(positions=np.zeros((37, 6), np.float32))
-    monkeypatch.setattr("train.demos.demonstrations.load_demonstrations", lambda path, spec: shown)
-    for kind in ("narrow", "with"):
-        (tmp_path / run_path(kind, 0, 0)).mkdir()
-        save_policy(tmp_path / run_path(kind, 0, 0) / "policy.npz", make_policy(make_arm_model))
-    scene = jobs.scene_of(tmp_path, TINY, Trial("narrow", 0, 0, "as shown"))
-    assert scene.twin._pipe == CrossPipe.of_mm(250.0) and len(scene.goals) == len(scene.names) == 37
-    operations = [name for name in scene.names if name.startswith(("pick", "place"))]
-    assert operations == ["pick left", "place bottom", "pick right", "place left"]
-    scene = jobs.scene_of(tmp_path, TINY, Trial("with", 0, 0))
-    assert scene.twin._pipe is None and np.array_equal(scene.goals, circle_poses(SPEC, 3).astype(float))
 
 
 def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp_path, make_arm_model):
@@ -297,25 +281,6 @@ def test_results_are_written_whole_without_what_is_no_number(tmp_path, monkeypat
     assert figures["targets"][0]["measured"] == "nan mm, 4 points missed in 1 of 2 runs"
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 1
     assert figures["calibrations"]["twin 1"] == {"Springs": ["off by much"]}
-
-
-def test_options_choose_settings_and_those_that_do_not_fit_are_refused(tmp_path, monkeypatch, capsys):
-    asked = []
-    monkeypatch.setattr(
-        experiments, "run", lambda *given: asked.append(given) or {"targets": [], "spreads": []}
-    )
-    out = ["--out", str(tmp_path)]
-    rods = ["--only", "open", "--arm", "rod", "--loads", "500", "--beside", "payload,payload"]
-    assert main(["paper", *rods, *out]) == 0
-    ((experiment, folder, _, settings),) = asked
-    assert (experiment, folder, settings.arm, settings.loads_g) == ("open", tmp_path, "rod", (500,))
-    assert settings.beside == ("payload",)
-    for words, why in (
-        (["--arm", "rod"], "--only: got None, expected open with --arm rod"),
-        (["--smoke", "--beside", "quick"], "--beside: got quick, expected none with --smoke"),
-    ):
-        assert main(["paper", *words, *out]) == 2
-        assert why in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """The race: clock and limits of contestants, with a made-up program; levels, targets and kept results."""
 
-import json
 import sys
 
 import jax
@@ -19,7 +18,6 @@ from benchmarks.race.race import (
     judge,
     limits_of,
     run,
-    summarise,
     train,
 )
 from mjx_softarm._support import xla
@@ -163,15 +161,6 @@ def test_a_target_is_the_peer_s_time_over_ours_once_both_have_raced_with_all_see
     assert (row["measured"], row["verdict"]) == judged
 
 
-def test_tables_have_times_with_start_up_and_without():
-    figures = summarise([result("ours-quick", 12.0, 8.0, 4.0), result(SBX, 20.0), FAILED])
-    ours, sbx = figures["wall_s"]
-    assert (ours["start_up"], ours["to_10_mm"], ours["to_3_mm"]) == (2.0, 17.0, "not within 32")
-    assert figures["wall_s_without_start_up"][0]["to_10_mm"] == 15.0 and sbx["to_10_mm"] == "not within 12"
-    assert figures["failed"] == [FAILED]
-    json.dumps(figures, allow_nan=False)
-
-
 @pytest.fixture
 def asked(monkeypatch):
     """Limits that each contestant was given, in place of training it; one of them fails."""
@@ -181,7 +170,7 @@ def asked(monkeypatch):
         asked[worker.name] = limits
         if worker.name == "ours-quick, seed 3":
             raise WorkerError(f"{worker.name}: got status 1")
-        return result("", 12.0, 8.0, 4.0)
+        return {key: result("", 12.0, 8.0, 4.0)[key] for key in ("start_up_s", "limit_s", "points")}
 
     monkeypatch.setattr(race, "train", made_up)
     monkeypatch.setattr(race, "peer_python", lambda name: PINS[name] and sys.executable)

@@ -73,20 +73,6 @@ def test_status_tells_stored_same_worse_and_no_baseline(machine, monkeypatch, ca
     assert main(["guard"]) == 2 and capsys.readouterr().err == "error: guard: no memory\n"
 
 
-def test_baselines_of_other_machines_stay_and_those_of_other_work_are_not_compared(machine, monkeypatch):
-    for kind, n_arms in ((KIND, 128), ("Slide rule, 4 cores", 64)):
-        monkeypatch.setattr(guard, "cpu_kind", lambda kind=kind: kind)
-        monkeypatch.setitem(guard.SIZES, "n_arms", n_arms)
-        machine += STORED
-        assert guard.main(store=True) == 0
-    machine += samples(epoch=(2.0,) * 3)
-    assert guard.main() == 0
-    assert json.loads(guard.FILE.read_text())["kinds"].keys() == {KIND, "Slide rule, 4 cores"}
-    monkeypatch.setattr(guard, "cpu_kind", lambda: KIND)
-    with pytest.raises(InputError, match="got no baseline"):
-        guard.main()
-
-
 def test_an_uncertain_baseline_is_not_stored(machine):
     machine += samples(epoch=(1.0, 1.0, 1.0, 1.1, 1.1), settle=(1.0, 1.0, 0.7, 1.3, 1.3))
     with pytest.raises(InputError, match="tolerance of settle: got more, expected at most 0.25"):
