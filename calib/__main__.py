@@ -1,4 +1,4 @@
-"""Command line: `python -m calib template | check | demo | run | plan`.
+"""Command line: `python -m calib template | check | demo | run`.
 
 Exit status: 0 done, 1 done but not to be trusted, 2 not done, 130 interrupted.
 """
@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 
 from mjx_softarm._support import cli
@@ -40,7 +39,7 @@ Strict = Annotated[
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
-    commands = {"template": _template, "check": _check, "demo": _demo, "run": _run, "plan": _plan}
+    commands = {"template": _template, "check": _check, "demo": _demo, "run": _run}
     return cli.main("python -m calib", "Calibrate an arm from its logs.", commands, arguments)
 
 
@@ -138,47 +137,6 @@ def _run(
         after = "train export RUN" if since else "train reach --preset analytic"
         print(f"next: python -m {after} --calibration {out}")
     return 1 if any(section.warnings for section in calibration.sections) else 0
-
-
-def _plan(
-    calibration: tyro.conf.Positional[Path], poses: int = 100, out: Path = Path("next.csv"), seed: int = 0
-) -> int:
-    """Choose poses to record next, for `python -m mjx_softarm.deploy record --plan`.
-
-    Args:
-        calibration: folder that `run` wrote
-        poses: number of poses
-        out: table of pressures to write, CSV
-        seed: seed of the candidates
-    """
-    from calib.arm import CalibratedArm
-    from calib.plan import RECORDED_FILE, load_recorded, plan
-    from mjx_softarm._support import xla
-    from mjx_softarm.logs.pressure_plan import write_plan
-
-    # Refuse what cannot be planned.
-    _check_seed(seed)
-    if poses < 1:
-        raise InputError(f"--poses: got {poses}, expected at least 1")
-    if out.exists():
-        raise InputError(f"--out: got {out}, which is there already, expected a new file")
-    arm = CalibratedArm.read(calibration)
-    recorded = load_recorded(calibration / RECORDED_FILE, arm.spec)
-    # Choose the poses, and tell what they are for.
-    xla.enable_compilation_cache()
-    found = plan(arm, recorded, poses, seed)
-    write_plan(out, found.pressure_kpa)
-    now, then = found.n_unknown
-    n_others = poses - found.n_informative - found.n_payload
-    print(f"{found.n_informative} poses for the fit, {found.n_payload} for the payload, {n_others} others")
-    print(f"unknown directions, as far as the fitted model tells: {now} now, {then} with these poses")
-    if found.half_width_kg:
-        (none, largest), (then_none, then_largest) = 1e3 * np.array(found.half_width_kg)
-        print(f"no payload, told at half of the poses: within {none:.0f} g now, {then_none:.0f} g with these")
-        print(f"the largest, at 95 %: within {largest:.0f} g now, {then_largest:.0f} g with these")
-    print(f"plan: {out}")
-    print(f"next: python -m mjx_softarm.deploy record --plan {out} --arm ARM --spec SPEC --out LOG")
-    return 0
 
 
 def _check_seed(seed: int) -> None:

@@ -85,7 +85,7 @@ def fit_changes(arm: CalibratedArm, poses: StaticPoses, seed: int = 0) -> Change
     mean = np.repeat([0.0, 1.0, 1.0 / n_chambers, 0.0], [n, 1, n_chambers, 1 + n_chambers])
     # On twins the loop's arrivals need 0.3 kPa less than recorded poses: all stiffnesses may be off by that
     shared = OFFSET_KPA[0] / rms_of(_elastic_kpa(spec, poses.spring_m + zero_m))
-    unmodelled = np.array(spec.unmodelled.pressure_kpa or np.zeros(n_chambers)) + offset_kpa
+    unmodelled = spec.unmodelled_kpa + offset_kpa
     return Changes(
         spec=spec.replace(
             sensor={"delta_m": tuple(map(float, spec.spring_sensor.delta_m + zero_m))},
@@ -137,7 +137,7 @@ def _model(arm: CalibratedArm, poses: StaticPoses, x: np.ndarray) -> tuple[np.nd
     simulated_kpa = np.asarray(found.pressure_kpa, float)
     if held is not None:
         simulated_kpa = held_kpa(held, spring_m, simulated_kpa, np.zeros_like(simulated_kpa))
-    left_kpa = measured_kpa - simulated_kpa - spec.unmodelled_kpa(spring_m)
+    left_kpa = measured_kpa - simulated_kpa - spec.unmodelled_kpa
     error = np.concatenate([tip, left_kpa], axis=1)
     error = np.where(found.valid[:, None], error, np.inf).reshape(1 + n, m, -1)
 

@@ -5,7 +5,6 @@ The result is a folder that training takes:
     arm.toml      the calibrated specification
     s2r.npz       the sim-to-real network, if there were poses to fit it to
     pressures.npz residual pressures that hold the arm, if there were poses to fit them to
-    recorded.npz  the poses, for `python -m calib plan`
     report.html   results with pictures, and whether to trust them
     report.json   the same for programs
     poses.npz     measured and simulated poses that the network was fitted to, for the view
@@ -21,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from calib.arm import CalibratedArm
-from calib.plan import RECORDED_FILE, Recorded, load_recorded, save_recorded
 from calib.read.measurements import measure
 from calib.read.static_poses import SAME_KG
 from calib.report.page import Section, to_html, to_json
@@ -36,13 +34,12 @@ from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated arm, the sections of the report, and what training, planning and the view need."""
+    """Calibrated arm, the sections of the report, and what training and the view need."""
 
     spec: ArmSpec
     sections: tuple[Section, ...]
     s2r: S2R | None  # None where it was not fitted, or is no better than the simulation
     held: HeldPressures | None  # None where they were not fitted, or are no better than the simulation
-    recorded: Recorded | None  # None where the chambers were not fitted
     pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
 
     @property
@@ -84,15 +81,7 @@ def calibrate(
         spec, section, found = step(measurements, spec, seed)
         report.append(section)
         extras |= found
-    # Join the poses with the errors that the steps found at them.
-    recorded = None
-    if "scale" in extras and "error_mm" in extras:
-        poses = measurements.poses
-        known = extras["error_mm"], extras["scale"], extras.get("covariance")
-        recorded = Recorded(poses.pressure_kpa, poses.payload_kg, *known)
-    return Calibration(
-        spec, tuple(report), extras.get("s2r"), extras.get("held"), recorded, extras.get("pairs", {})
-    )
+    return Calibration(spec, tuple(report), extras.get("s2r"), extras.get("held"), extras.get("pairs", {}))
 
 
 def go_on(
@@ -126,15 +115,9 @@ def load_calibration(folder: Path) -> Calibration:
     Raises:
         InputError: a file is missing, damaged, or of another arm.
     """
-    (spec, s2r, held), recorded = CalibratedArm.read(folder), folder / RECORDED_FILE
-    return Calibration(
-        spec,
-        (),
-        s2r,
-        held,
-        load_recorded(recorded, spec) if recorded.exists() else None,
-        read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {},
-    )
+    spec, s2r, held = CalibratedArm.read(folder)
+    pairs = read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {}
+    return Calibration(spec, (), s2r, held, pairs)
 
 
 def refuse_existing(folder: Path) -> None:
@@ -170,8 +153,6 @@ def write_calibration(
         part.mkdir(parents=True)
         calibration.spec.to_toml(part / ARM_FILE)
         calibration.arm.write_models(part)
-        if calibration.recorded is not None:
-            save_recorded(part / RECORDED_FILE, calibration.recorded)
         if calibration.pairs:
             write_pose_pairs(part, calibration.pairs)
         report = (calibration.sections, findings, provenance)

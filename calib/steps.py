@@ -31,14 +31,13 @@ from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import motion, sections
 from calib.report.changes import CHANGES, PAYLOADS, changes_section, payloads_section
 from calib.report.page import Section
-from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.pose_pairs import PosePairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.sensing.held_pressures import HeldPressures
+from mjx_softarm.sensing.load import KNOWN
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, extrapolation
-from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import Unmodelled
+from mjx_softarm.spec import ArmSpec, Unmodelled
 
 MIN_S2R_POSES = 60
 NOT_FITTED = "Not fitted: the specification's values stay."
@@ -47,9 +46,6 @@ NOT_FITTED = "Not fitted: the specification's values stay."
 class Extras(TypedDict, total=False):
     """Results beside the specification. A step adds some; a later step may replace them."""
 
-    scale: np.ndarray  # (2, 3) or (2, 4) robust errors, see `calib.fit.chambers.ChamberFit`
-    covariance: np.ndarray  # (p, p) of the parameters of chambers, backbone and mounting
-    error_mm: np.ndarray  # (n,) tip error at each static pose
     s2r: S2R
     held: HeldPressures  # residual pressures of the unloaded arm
     pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
@@ -106,11 +102,7 @@ def chambers(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult
     # Check the chambers' lengths by markers along the arm.
     if fit.has_markers and fit.poses.marker_m.shape[1] >= MIN_MARKERS:
         section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
-    # Give a pose at which the simulated arm finds no rest the mean error.
-    known = np.isfinite(fit.tip_error_mm)
-    error_mm = np.where(known, fit.tip_error_mm, np.mean(fit.tip_error_mm[known]))
-    extras = Extras(scale=fit.scale, covariance=fit.covariance, error_mm=error_mm)
-    return StepResult(fit.spec if fit.is_better else spec, section, extras)
+    return StepResult(fit.spec if fit.is_better else spec, section)
 
 
 def actuators(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
@@ -161,12 +153,9 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
         "simulated": PosePairs(real, settled.pose, np.zeros(len(real), bool)),
         "with the network": PosePairs(real, corrected, away > 1.0),
     }
-    # Give a pose that was not held out the mean error of the held-out poses.
-    error_mm = np.full(poses.n, fit.test.translation_mean_mm)
-    error_mm[used[fit.held_out]] = pairs["with the network"].error_mm[fit.held_out]
     # Fit the pressures that hold the arm.
     held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
-    extras = Extras(pairs=pairs, error_mm=error_mm)
+    extras = Extras(pairs=pairs)
     if fit.is_better:
         extras["s2r"] = fit.s2r
     if not held.is_better:
@@ -176,7 +165,7 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     largest_kg = spec.mass.largest_payload_kg
     at = payload_poses(CalibratedArm(spec, extras.get("s2r")))
     widths_kg = told_widths(held.held, at, largest_kg)
-    section = sections.with_pressures(section, held, widths_kg, LOOP.load_known * largest_kg)
+    section = sections.with_pressures(section, held, widths_kg, KNOWN * largest_kg)
     return StepResult(spec, section, extras)
 
 

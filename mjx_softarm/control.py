@@ -39,8 +39,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import LEAST_CHAMBERS
+from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
 
 AT_LIMIT_KPA = 0.2  # distance to a limit at which a measured, noisy pressure counts as at it
 TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference; a run may set another
@@ -81,13 +80,13 @@ def chambers_of_springs(spec: ArmSpec) -> np.ndarray:
 
     A chamber's length is that of the plane through its section's springs, at the chamber's own radius.
     """
-    c, s, out = spec.structure.chambers_per_section, spec.springs_per_section, []
+    c, s, blocks = spec.structure.chambers_per_section, spec.springs_per_section, []
     radii = map(spec.per_section, (spec.geometry.chamber_radius_m, spec.geometry.spring_radius_m))
     for section, (chamber, spring) in enumerate(zip(*radii, strict=True)):
         rows = np.zeros((c, spec.n_springs))
         rows[:, section * s : (section + 1) * s] = planes(c, chamber) @ np.linalg.pinv(planes(s, spring))
-        out.append(rows)
-    return np.concatenate(out)
+        blocks.append(rows)
+    return np.concatenate(blocks)
 
 
 class Gains(NamedTuple):

@@ -140,12 +140,14 @@ class Regulator(Actuators):
         return self.offset_kpa
 
     def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
-        own: Any = self  # numbers are () or (n,)
+        numbers: Any = self  # numbers are () or (n,)
         xp = array_namespace(gas_m3, volume_m3, command_kpa, *vars(self).values())
-        missing_kpa = command_kpa + own.offset_kpa - pressure_of(gas_m3, volume_m3)
-        outside_kpa = missing_kpa - xp.clip(missing_kpa, -own.deadband_kpa, own.deadband_kpa)
-        share = -xp.expm1(-dt_s / own.lag_s)
-        change_kpa = xp.clip(share * outside_kpa, -dt_s * own.vent_kpa_per_s, dt_s * own.fill_kpa_per_s)
+        missing_kpa = command_kpa + numbers.offset_kpa - pressure_of(gas_m3, volume_m3)
+        outside_kpa = missing_kpa - xp.clip(missing_kpa, -numbers.deadband_kpa, numbers.deadband_kpa)
+        share = -xp.expm1(-dt_s / numbers.lag_s)
+        change_kpa = xp.clip(
+            share * outside_kpa, -dt_s * numbers.vent_kpa_per_s, dt_s * numbers.fill_kpa_per_s
+        )
         return gas_m3 + volume_m3 * change_kpa / ATMOSPHERE_KPA
 
 

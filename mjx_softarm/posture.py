@@ -35,8 +35,8 @@ def turned_poses(spec: ArmSpec, position_mm: np.ndarray) -> np.ndarray:
     """Return poses (..., 6) [mm, deg] of tips along the arm's axis, at places (..., 3) as if it hung."""
     turn = posture(spec)
     angles_deg = pose_from_frame(np.zeros(3), turn)[3:] + 0.0  # without a negative zero
-    at = position_mm @ turn.T
-    return np.concatenate([at, np.broadcast_to(angles_deg, at.shape)], axis=-1)
+    place_mm = position_mm @ turn.T
+    return np.concatenate([place_mm, np.broadcast_to(angles_deg, place_mm.shape)], axis=-1)
 
 
 def straight_pose(spec: ArmSpec) -> np.ndarray:
@@ -57,11 +57,11 @@ def check_posture(spec: ArmSpec) -> None:
         return
 
     # The same arm with the base's x axis horizontal; its chambers go back by as much
-    own = np.arctan2(turn[2, 0], turn[2, 1])
-    other = np.degrees(rotation_vector(turn @ rotation_about(np.array([0.0, 0.0, -own]))))
+    roll = np.arctan2(turn[2, 0], turn[2, 1])
+    other = np.degrees(rotation_vector(turn @ rotation_about(np.array([0.0, 0.0, -roll]))))
     raise SpecError(
         f"{spec.name}: mounting.base_turn_deg: got {spec.mounting.base_turn_deg}, a pitch of {pitch_deg:.0f} "
         f"deg of the straight arm's tip, expected {MOST_PITCH_DEG:g} at most, since yaw and roll are one "
         f"at 90 deg: the same arm has [{', '.join(f'{angle:.6g}' for angle in other + 0.0)}], and "
-        f"{np.degrees(own) + 0.0:g} more in geometry.first_chamber_deg"
+        f"{np.degrees(roll) + 0.0:g} more in geometry.first_chamber_deg"
     )

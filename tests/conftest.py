@@ -12,7 +12,7 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.policy.networks import ArmModel
+from mjx_softarm.policy.file import ArmModel
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
 from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LEVELS = (
     ("_support",),
     ("sensing", "arms"),
-    ("spec", "spec_tables", "pneumatics"),
+    ("spec", "pneumatics"),
     ("mechanics", "control", "logs", "posture"),
     ("mdp",),
     ("env", "policy"),

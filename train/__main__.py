@@ -17,8 +17,8 @@ COMMANDS = {
     "reach": "train.runs.command:Reach",
     "imitate": "train.runs.command:Imitate",
     "evaluate": "train.runs.command:evaluate",
-    "export": "train.runs.command:export",
-    "sweep": "train.sweep.command:SweepCommand",
+    "export": "train.runs.export:export",
+    "sweep": "train.sweep:Sweep",
     "demos record": "train.demos.command:Record",
     "demos check": "train.demos.command:Check",
 }

@@ -28,11 +28,10 @@ from mjx_softarm._support import cli, xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.state import PAYLOAD_SHARE, State
 from mjx_softarm.mdp.actions import N_ACTIONS
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
-from train.agent.registry import World, learner_of
+from train.agent.registry import epoch_of
 from train.config import TrainConfig, override
 from train.presets import PRESETS
 from train.runs import evaluate
@@ -52,7 +51,7 @@ class PressureEnv(ReachEnv):
         params = self.params_of(arm)
         low, high = params.pressure_min_kpa, params.pressure_max_kpa
         pressure_kpa = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
-        held = settle_pressures(chain_kinematics(params), params, pressure_kpa, self.n_at_once)
+        held = settle_pressures(params, pressure_kpa, self.n_at_once)
         return super().step(state, self.action_of(held.spring_m + arm.sensor_offset_m))
 
 
@@ -118,7 +117,7 @@ class PolicyTrial:
         self.paths = paths_of(jnp.concatenate(goals_of(env, n_goals)))
         self.keys = start_keys(len(self.paths))
         self._job = task_of(config, kind.env(spec, config.env)).job
-        one = functools.partial(follow, env, learner_of(config.learner, World(env)))
+        one = functools.partial(follow, env, epoch_of(config.learner, env).learner)
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
 
     def run(self, seed: int) -> list[dict[str, Any]]:

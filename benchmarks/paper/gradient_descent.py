@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from mjx_softarm.deploy.moving.lead import Plan
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import pose_error
@@ -34,7 +33,7 @@ DIFFERENCE_M = 1e-5
 Residual = Callable[[np.ndarray], np.ndarray]  # springs (..., n) [m] -> error (..., 6) [mm, deg]
 
 
-def gradient_descent(policy: Policy) -> Plan:
+def gradient_descent(policy: Policy) -> Callable[..., np.ndarray]:
     """Return a plan for `Controller.of` that replaces the policy's actor."""
     low_m, high_m = policy.sensor.lengths(np.stack(policy.actions[1:])).length_m  # (n,) each
     pose_of = forward_kinematics(policy)

@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.accuracy import measure as accuracy
+from mjx_softarm.deploy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import LoopRun
 from mjx_softarm.deploy.safety import Fault
-from mjx_softarm.deploy.session import follow, trace
+from mjx_softarm.deploy.session import LoopRun, follow, trace
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.sensing.pose import frame_from_pose
 

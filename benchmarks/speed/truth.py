@@ -19,7 +19,6 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.lazy import put
 from mjx_softarm.env.vector import over_arms
 from mjx_softarm.mechanics import settle as solver
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.mjx_rest import measured
 from mjx_softarm.mechanics.params import ArmParams
@@ -46,7 +45,7 @@ def settle_function(
     model, data = put(build_model(spec)) if engine == "mjx" else (None, None)
 
     def at_rest(reference_m: Array) -> solver.Settled:
-        proposed = solver.settle(chain_kinematics(params), params, reference_m, n_at_once)
+        proposed = solver.settle(params, reference_m, n_at_once)
         return proposed if model is None else measured(model, data, params, proposed)
 
     return xla.jit(over_arms(at_rest, mesh))

@@ -51,7 +51,6 @@ class ChamberFit:
 
     spec: ArmSpec  # arm of the last fit; springs may be commanded over the range measured at rest
     half_width_95: Mapping[str, np.ndarray]  # half-widths of 95 % intervals, by fields of the specification
-    covariance: np.ndarray  # (p, p) of the last fit's parameters
     direction_widths: np.ndarray  # (p,) half-widths along principal directions, in tolerances
     weak: tuple[str, ...]  # unknown directions, whose width is above 1, in words
     weak_tip_mm: np.ndarray  # largest movement of the tip along each unknown direction, within its interval
@@ -123,7 +122,6 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
     found = ChamberFit(
         spec=calibrated,
         half_width_95=half_widths(calibrated, solution.covariance),
-        covariance=solution.covariance,
         direction_widths=widths,
         weak=tuple(_describe(*numbers, names(spec)) for numbers in each),
         weak_tip_mm=weak_tip_mm,
@@ -220,7 +218,7 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
     if found.weak:
         worth = f"{len(found.weak)} unknown directions, each worth up to {found.weak_tip_mm.max():.1f} mm"
         springs = ", with spring lengths" if np.isnan(found.poses.spring_m).any() else ""
-        remedy = f"record the poses of `python -m calib plan`{springs}"
+        remedy = f"record more random poses{springs}"
         said.append("\n  ".join([f"{worth}: {remedy}", *found.weak]))
     # Look at the range of the pressures.
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa

@@ -58,11 +58,8 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
     arm = with_numbers(x, params._replace(tool_mass_kg=masses))
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        kinematics = chain_kinematics(arm)
-        found = settle_pressures(
-            kinematics, arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa)
-        )
-        frames = kinematics(found.q)
+        found = settle_pressures(arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa))
+        frames = chain_kinematics(arm)(found.q)
         chamber_m = tendons(jax.lax.stop_gradient(frames), arm.chamber_site_m).length.reshape(-1)
         turn = measured.tip_rotation.T @ found.tip_rotation
         end_m = _section_ends(frames, marker_sites(x, arm))

@@ -35,8 +35,7 @@ from mjx_softarm._support.fields import scaled
 from mjx_softarm._support.small_matrices import product
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.pose import rotation_about, rotation_from_quaternion, rotation_vector
-from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import BONDS, Structure
+from mjx_softarm.spec import BONDS, ArmSpec, Structure
 
 # The four parameters of a chamber.
 FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")

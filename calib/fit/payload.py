@@ -38,7 +38,6 @@ from calib.read.static_poses import StaticPoses
 from mjx_softarm._support import xla
 from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import arms_at_once, settle
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
@@ -111,7 +110,7 @@ def _rises(n_at_once: int | None) -> Callable[..., Array]:
     """Return a program for the derivative (..., n_springs) of the payload's rise by S2R, by the springs."""
 
     def rise_m(reference_m: Array, params: ArmParams, s2r: S2R) -> Array:
-        end = settle(chain_kinematics(params), params, reference_m, n_at_once)
+        end = settle(params, reference_m, n_at_once)
         frame = end.tip_position_m, end.tip_rotation
         simulated_m, real_m = (_height_m(at, params) for at in (frame, corrected(s2r, frame, end.spring_m)))
         return real_m - simulated_m
@@ -197,7 +196,7 @@ def weighed(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> Weighed
     # Tell the weights by what pressures remain
     weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
     kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
-    kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)[rows] - spec.unmodelled_kpa(spring_m)
+    kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)[rows] - spec.unmodelled_kpa
     told_kg, _ = told_payload(arm, spring_m, kpa)
     # Least squares for their ratio, with a prior: what a weight can tell of a factor's deviation
     information, prior = np.sum(weight_kg**2), COMMON_FACTOR**2 - LEFT_FACTOR**2

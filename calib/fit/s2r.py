@@ -98,10 +98,9 @@ def without_limits(spec: ArmSpec) -> ArmParams:
 @functools.cache
 def _solver(n_at_once: int | None):
     def one(params: ArmParams, reference: jax.Array) -> SimulatedPoses:
-        kinematics = chain_kinematics(params)
-        end: Any = settle(kinematics, params, reference, n_at_once)
+        end: Any = settle(params, reference, n_at_once)
         pose = pose_from_frame(end.tip_position_m, end.tip_rotation)
-        at_sections = sections(kinematics(end.q), params, end.spring_m)
+        at_sections = sections(chain_kinematics(params)(end.q), params, end.spring_m)
         return SimulatedPoses(pose, end.spring_m, end.pressure_kpa, end.settled, at_sections)
 
     return xla.jit(jax.vmap(one, in_axes=(None, 0)))

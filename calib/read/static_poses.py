@@ -14,12 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.control import Gains
-from mjx_softarm.deploy.belief import still
-from mjx_softarm.deploy.controller import middle_kpa, rest_of
 from mjx_softarm.logs.rest import HOLD_KPA, NEEDED, holds, last_second, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.policy.lag import law_lag_s
+from mjx_softarm.policy.lag import law_lag_s, middle_kpa, rest_rule, still
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.sensing.sensors import SensorFault
 from mjx_softarm.spec import ArmSpec
@@ -146,7 +144,7 @@ def _rests_of_loop(
 ) -> Iterator[np.ndarray]:
     """Find the rows of each rest in a log of the control loop: the last window of each goal that stood."""
     assert log.goal is not None
-    n, config = rest_of(spec, _lag_s(spec))
+    n, still_m, _ = rest_rule(spec, _lag_s(spec))
     readings = log.readings_of(spec.sensor)
     watched_m = log.spring_m if readings is None else spec.spring_sensor.lengths(readings, np.nan).length_m
     # A goal that stands for a window, and no longer than the payload; a moving goal has no such rows
@@ -158,7 +156,7 @@ def _rests_of_loop(
             continue
         row_uses["goal not held long enough"] += len(rows) - n
         rows = _last_held(rows, log.reference_m, n)
-        if watched_m is not None and still(watched_m[rows], config):
+        if watched_m is not None and still(watched_m[rows], still_m):
             yield rows
         else:
             row_uses["tip still moving"] += n

@@ -222,7 +222,7 @@ def with_pressures(
     warnings = section.warnings
     if largest_g > 1e3 * known_kg:
         told = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
-        warnings += (f"{told}: record the poses of `python -m calib plan`",)
+        warnings += (f"{told}: record more random poses",)
     return dataclasses.replace(section, text=section.text + text, warnings=warnings, data=section.data | data)
 
 

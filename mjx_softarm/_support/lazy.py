@@ -32,6 +32,23 @@ class LazyModule:
         return getattr(self._load(self._name), attribute)
 
 
+def _keep_bodies_apart() -> None:
+    """Keep XLA from fusing MJX's computations of one body with those of the next.
+
+    MJX writes a chain of bodies out body by body, and XLA's fusions repeat what bodies share: on a CPU the
+    kinematics of a dozen links then compile for minutes, on their way into `jax.jit` by anybody. A barrier
+    after each body changes no number. With it MJX compiles in half of the time of the best options without.
+    """
+    scan = importlib.import_module("mujoco.mjx._src.scan")
+    body_tree = scan.body_tree
+
+    @functools.wraps(body_tree)
+    def apart(m: Any, function: Callable, *rest: Any, **options: Any) -> Any:
+        return body_tree(m, lambda *x: jax.lax.optimization_barrier(function(*x)), *rest, **options)
+
+    scan.body_tree = apart
+
+
 @functools.cache
 def _import_quietly(name: str) -> Any:
     with contextlib.redirect_stdout(io.StringIO()) as said:
@@ -39,6 +56,8 @@ def _import_quietly(name: str) -> Any:
     for line in said.getvalue().splitlines():
         if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
             print(line)
+    if name == "mujoco.mjx":
+        _keep_bodies_apart()
     return module
 
 

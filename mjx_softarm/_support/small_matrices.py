@@ -72,21 +72,6 @@ def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) 
     return jnp.moveaxis(_eliminate_last(jnp.concatenate(parts, axis=1)), -1, 0), True
 
 
-@jax.custom_vjp
-def solve_approximate_gradient(matrix: Array, columns: Array) -> Array:
-    """Multiply the inverse of a symmetric matrix (n, n) by columns (n, k), by `eliminate`.
-
-    The gradient is approximate: it is by the columns alone, as if the matrix were a constant.
-    """
-    return eliminate(matrix, columns)
-
-
-solve_approximate_gradient.defvjp(
-    lambda matrix, columns: (eliminate(matrix, columns), matrix),
-    lambda matrix, d_found: (None, eliminate(matrix, d_found)),
-)
-
-
 def _eliminate_last(augmented: Array) -> Array:
     """Eliminate in matrices beside columns (n, n + k, *arms).
 

@@ -111,6 +111,36 @@ def in_chunks(function: Callable, n: int, n_chunks: int, batched: Any, arguments
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
 
 
+def rows_last(function: Callable, n_at_once: int | None = None, n_shared: int = 0) -> Callable:
+    """Return a function of one row; `jax.vmap` of it calls `function` with the rows as last axis.
+
+    Args:
+        function: maps trees of arrays (..., *rows) to another; *rows may be empty.
+        n_at_once: rows of a chunk; None for all of them.
+        n_shared: number of last arguments whose arrays have a last axis of 1 where all rows share them.
+    """
+    one = jax.custom_batching.custom_vmap(function)
+
+    def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
+        def last(x: Any, own: bool, shape: tuple[int, ...]) -> jax.Array:
+            x = jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
+            return jnp.broadcast_to(x, (*x.shape[:-1], *shape)) if shape else x
+
+        if n_at_once and n_at_once < n:
+            found = in_chunks(one, n, -(-n // n_at_once), batched, arguments)
+        else:
+            n_own = len(arguments) - n_shared
+            rows = [
+                jax.tree.map(functools.partial(last, shape=(n,) if k < n_own else ()), *pair)
+                for k, pair in enumerate(zip(arguments, batched, strict=True))
+            ]
+            found = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), function(*rows))
+        return found, jax.tree.map(lambda _: True, found)
+
+    one.def_vmap(many)
+    return one
+
+
 def jit_at_first_call(**kwargs: Any) -> Callable[[Callable], Callable]:
     """Return a decorator that compiles as `jit` does, for functions of a module.
 

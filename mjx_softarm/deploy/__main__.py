@@ -6,38 +6,37 @@ However a command ends, the arm is vented and what was logged is written.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.accuracy.budget import budget, draw
-from mjx_softarm.deploy.accuracy.measure import (
+from mjx_softarm.deploy.budget import budget, draw
+from mjx_softarm.deploy.capture import CapturedArm, with_capture
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.drivers.names import check_arm, check_number, open_arm, twin_spec
+from mjx_softarm.deploy.ending import MISSED, save_log
+from mjx_softarm.deploy.link import first_frame
+from mjx_softarm.deploy.measure import (
     along,
     figures,
     measure,
+    print_figures,
+    print_run,
     read_goals,
     ways_of,
     whole_goal,
     write_accuracy,
 )
-from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
-from mjx_softarm.deploy.controller import LOOP, Controller
-from mjx_softarm.deploy.drivers.driven import Arms, finish
-from mjx_softarm.deploy.drivers.names import twin_spec
-from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
-from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
-from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.session import follow, trace
+from mjx_softarm.deploy.session import LoopRun, follow, trace
 from mjx_softarm.logs.files import check_file
-from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import SHIPPED, load_policy
@@ -66,12 +65,40 @@ PolicyFile = Annotated[
         help_behavior_hint="(default: the package's own, for the paper's arm)",
     ),
 ]
-GoOn = Annotated[
-    bool,
+Arm = Annotated[
+    str,
     tyro.conf.arg(
-        help="go on without the first chamber that loses its pressure, with the others, instead of venting"
+        help="yours: package.module:Class, or a file of hardware, wiring.toml; simulated: twin:SEED, or "
+        "twin:rod:SEED; twin:SEED@ARM.toml, of another arm; twin:SEED:pipe300, in a pipe; "
+        "twin:SEED:aged, later; twin:SEED:exact, as specified; twin:SEED:500g, with a payload"
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """Options of a command that drives an arm: the arm, and motion capture beside its driver."""
+
+    arm: Arm
+    capture: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="SYSTEM:HOST:BODY",
+            help="natnet:HOST:BODY or qualisys:HOST:BODY, for an arm whose driver has no motion capture; "
+            "options: ,base=BODY,markers=NAME,up=y|z",
+        ),
+    ] = None
+
+    def open(self, spec: ArmSpec, tell: Callable[[str], None]) -> Any:
+        """Open the driver of an arm with this specification, and its motion capture, which reports its gaps.
+
+        Raises:
+            InputError: one of them cannot be had.
+        """
+        return with_capture(open_arm(self.arm), self.capture, spec, tell)
+
+
+Arms = Annotated[ArmOptions, tyro.conf.arg(name="")]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -87,7 +114,6 @@ def _run(
     log: cli.MaybePath = None,
     duration: float = np.inf,
     stay: bool = False,
-    go_on: GoOn = False,
 ) -> int:
     """Bring the tip to goals; errors are by motion capture if the arm has it.
 
@@ -103,7 +129,7 @@ def _run(
         raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
-    controller = _controller(policy, go_on)
+    controller = _controller(policy)
     goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
     driver = on.open(controller.policy.spec, tell)
@@ -116,14 +142,14 @@ def _run(
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver, tell)
-    tell_run(run, controller.policy)
+    print_run(run, controller.policy)
     return run.status
 
 
-def _controller(policy: Path, go_on: bool) -> Controller:
+def _controller(policy: Path) -> Controller:
     if policy == SHIPPED:
         tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
-    return Controller.of(load_policy(policy), config=replace(LOOP, go_on=go_on))
+    return Controller.of(load_policy(policy))
 
 
 def _measure(
@@ -134,7 +160,6 @@ def _measure(
     points: int = 16,
     seconds: float | None = None,
     payload: float = 0.0,
-    go_on: GoOn = False,
 ) -> int:
     """Measure a policy's accuracy on an arm with motion capture, and say what makes the error.
 
@@ -150,13 +175,9 @@ def _measure(
         raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
-    if seconds is not None and go_on:
-        raise InputError(
-            f"--go-on: got --seconds {seconds:g}, expected stops: a goal that moves does not wait"
-        )
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
-    controller = _controller(policy, go_on)
+    controller = _controller(policy)
     poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
@@ -181,7 +202,7 @@ def _measure(
     finish(driver, tell)
     if run.arrivals:
         _tell_measured(run, controller, poses, out, payload_kg if seconds is None else None)
-    tell_run(run, controller.policy)
+    print_run(run, controller.policy)
     return run.status
 
 
@@ -198,19 +219,19 @@ def _tell_measured(
         payload_kg: payload at the gripper; None: do not say what makes the error.
     """
     accuracy, ways = measure(run, controller, poses), ways_of(run)
-    found = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
+    numbers = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
         **(along(ways, controller.dt_s) if ways else {}),
     }
     split = None if payload_kg is None else budget(run, controller, payload_kg)
     if split is not None:
-        found["budget"] = split.figures()
-    if missing := write_accuracy(out, accuracy, found, ways):
+        numbers["budget"] = split.figures()
+    if missing := write_accuracy(out, accuracy, numbers, ways):
         print(missing)
     elif split is not None:
         draw(split, out / "budget.png")
-    tell_accuracy(found)
+    print_figures(numbers)
     if split is not None:
         print("\n".join(split.lines()))
     print(f"figures: {out / 'accuracy.json'}")
@@ -221,7 +242,6 @@ def _record(
     out: Path,
     spec: cli.SpecFile = None,
     poses: int = 500,
-    plan: cli.MaybePath = None,
     seed: int = 0,
     transients: bool = False,
 ) -> int:
@@ -230,15 +250,14 @@ def _record(
     Args:
         out: log to write, CSV or npz
         poses: number of random poses
-        plan: pressures in place of random ones, from `python -m calib plan`
         seed: seed of the poses
         transients: log every tick, not the static poses alone
     """
     # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
-    own = twin_spec(on.arm)
-    arm_spec = ArmSpec.of(spec or own)
+    twin = twin_spec(on.arm)
+    arm_spec = ArmSpec.of(spec or twin)
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
@@ -246,13 +265,13 @@ def _record(
     driver = on.open(arm_spec, tell)
     check_number(driver, arm_spec, f"--arm {on.arm}")
     low, high = arm_spec.chambers.pressure_min_kpa, arm_spec.chambers.pressure_max_kpa
-    default = "" if spec or own else ", by default; --spec names another arm"
+    default = "" if spec or twin else ", by default; --spec names another arm"
     tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
-    if spec and on.arm.startswith("twin:") and ArmSpec.of(own).geometry != arm_spec.geometry:
+    if spec and on.arm.startswith("twin:") and ArmSpec.of(twin).geometry != arm_spec.geometry:
         tell(f"{on.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results
-    targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
+    targets_kpa = growing(random_pressures(arm_spec, poses, seed))
     result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out))
     finish(driver, tell)
     if not len(result.log):
@@ -266,6 +285,12 @@ def _record(
     if result.ending.cause:
         print(f"ended early: {result.ending.cause}", file=sys.stderr)
     return result.ending.status
+
+
+def finish(driver: Any, tell: Callable[[str], None]) -> None:
+    """End the motion capture that `--capture` began, and report its frames in a line."""
+    if isinstance(driver, CapturedArm):
+        tell(driver.finish())
 
 
 def tell(text: str) -> None:

@@ -10,7 +10,7 @@ has
     time_s                           optional  clock [s] of a simulated arm, for which no tick waits
 
 No controller uses motion capture; an OSError of `motion_capture` is a missed frame, a gap in the log.
-`mjx_softarm.deploy.drivers` has drivers over serial and UDP that need only your numbers. An exception other
+`mjx_softarm.deploy.drivers` has a driver over a serial line that needs only your numbers. An exception other
 than those named here ends the run as a fault: the arm is vented and the log is written.
 """
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from mjx_softarm.control import Gains, LawState, at_chambers, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.belief import read_lengths, still
-from mjx_softarm.deploy.controller import LOOP
-from mjx_softarm.deploy.link import VENT_KPA_PER_S, ArmFault, Link
+from mjx_softarm.deploy.belief import read_lengths
+from mjx_softarm.deploy.link import LOST_TICKS, VENT_KPA_PER_S, ArmFault, Link
+from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S, WINDOW_S, still
 from mjx_softarm.spec import ArmSpec
 
 RAMP_M_PER_S = 0.03  # speed of the reference with the longest way
@@ -79,12 +79,12 @@ class Drive:
         self.on_tick = on_tick
         self.spec, self.sensor, self.gains = spec, spec.spring_sensor, Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
-        self.window = max(2, round(LOOP.window_s * spec.control.rate_hz))
+        self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
         self.link = Link(arm, spec, self.dt_s)
         self.n_lost = 0
 
     def to_rest(
-        self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = LOOP.settle_timeout_s
+        self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = SETTLE_TIMEOUT_S
     ) -> dict | None:
         """Drive until the springs are at rest and the law has reached its target.
 
@@ -127,7 +127,7 @@ class Drive:
         self.n_lost = self.n_lost + 1 if lost.any() else 0
         known_m = None if lost.any() else spring_m
         try:
-            most = LOOP.lost_ticks
+            most = LOST_TICKS
             if self.n_lost >= most:
                 raise ArmFault(
                     f"sensors: got {self.n_lost} lost readings in a row, expected under {most}: {text}"

@@ -1,4 +1,4 @@
-"""End of a drive, alike for runs and recordings, and the results of a run.
+"""End of a drive, alike for runs and recordings.
 
 Whatever ends a drive, the pressures are ramped to zero and the log is written.
 """
@@ -9,15 +9,11 @@ import contextlib
 import signal
 import tempfile
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from mjx_softarm.deploy.link import Link, describe
-from mjx_softarm.deploy.safety import Event, Fault
 from mjx_softarm.logs.schema import Log, write_log
 
 # Exit statuses; that of a signal is 128 + its number.
@@ -42,48 +38,13 @@ class Ending(NamedTuple):
     vented: bool = True
 
 
-class Arrival(NamedTuple):
-    """An arrival: the springs have settled after the last action towards a goal."""
-
-    goal: np.ndarray  # (6,) [mm, deg]
-    estimate: np.ndarray  # (6,) [mm, deg] believed pose
-    row: int  # index of the log's row
-    index: int  # index of the goal in the list of goals
-    reached: bool = True  # within the policy's threshold of a goal, by motion capture if there is any
-
-
-class LoopRun(NamedTuple):
-    """Results of a run of the control loop."""
-
-    log: Log
-    arrivals: tuple[Arrival, ...]
-    events: tuple[Event, ...]
-    latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
-    ending: Ending
-    n_goals: int = 0  # number of goals asked for; 0 with a pilot
-    ways: tuple[slice, ...] = ()  # rows of the log in which the goal moved
-
-    def counts(self) -> dict[Fault, int]:
-        """Return the number of events of each fault."""
-        return dict(Counter(event.fault for event in self.events))
-
-    @property
-    def status(self) -> int:
-        """Exit status of the ending; after a good one `MISSED` if a goal was not reached or was refused.
-
-        A pilot's goals do not count.
-        """
-        n_reached = sum(arrival.reached for arrival in self.arrivals)
-        return self.ending.status or (MISSED if n_reached < self.n_goals else DONE)
-
-
 def vent_at_end(
     body: Callable[[], Any], link: Link, tell: Callable[[str], Any], save: Callable[[], Any] = lambda: None
 ) -> Ending:
     """Run `body`, then vent the arm and save the log, whatever happens.
 
     Any exception, Ctrl-C, SIGTERM and SIGHUP end the body. During venting and saving they are noted and
-    change nothing; only a second Ctrl-C ends the venting. Lines are told last, since a terminal may block.
+    change nothing; only a second Ctrl-C ends the venting. Lines are printed last, since a terminal may block.
 
     Args:
         body: drives the arm.
@@ -169,7 +130,7 @@ class _Finish:
 
 @contextlib.contextmanager
 def _signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Hand SIGINT, SIGTERM, and SIGHUP of a terminal that closes, to a handler."""
+    """Install the handler for SIGINT, SIGTERM, and SIGHUP of a terminal that closes."""
     names = ("SIGINT", "SIGTERM", "SIGHUP")
     if threading.current_thread() is not threading.main_thread():
         names = ()

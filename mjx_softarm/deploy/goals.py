@@ -1,24 +1,53 @@
-"""Goals of a run: from a list, or by a pilot's orders."""
+"""Goals of a run: from a list, by somebody's orders, or one that moves past poses.
+
+Each kind is a `Goals`. Only `n_goals` of them count for the run's exit status.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.loop import LoopState, Tick, hold, release, with_goal
-from mjx_softarm.deploy.lost import GoalSearch
+from mjx_softarm.deploy.loop import LoopState, hold, release, with_goal
+from mjx_softarm.deploy.moving import lead_of, to_moving_goal
 from mjx_softarm.deploy.safety import Event
+from mjx_softarm.sensing.pose import pose_error
 
-Note = Callable[[Sequence[Event]], None]
+Events = tuple[Event, ...]
+# An order for the next tick: let the pressures go to zero, after which a goal brings the arm up again; give
+# up the goals and hold the springs where they are; poses (6,) [mm, deg] that replace all others; no change
+Order = Literal["vent", "hold"] | Sequence[np.ndarray] | None
+
+
+class Goals(Protocol):
+    """Interface of a source of goals."""
+
+    n_goals: int  # number of goals that count
+    n_taken: int  # number of goals taken or refused so far
+
+    @property
+    def ways(self) -> Sequence[slice]:
+        """Rows of the log in which the goal moved."""
+        ...
+
+    def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
+        """Return the state with the goal of a tick, None where the run is over; and refusals of goals.
+
+        Args:
+            state: after the last tick.
+            now_s: time.
+            row: of the log.
+        """
+        ...
 
 
 class ListedGoals:
     """Goals one after the other, as `follow` takes them; goals in `refused`, by index, are skipped."""
 
-    ways = ()  # rows of the log in which the goal moved
+    ways: Sequence[slice] = ()
 
     def __init__(
         self,
@@ -29,82 +58,117 @@ class ListedGoals:
         stay: bool = False,
     ):
         self._controller, self._goals, self._refused = controller, list(goals), refused
-        self._duration_s, self._began_s, self._stays, self._accepted = duration_s, np.nan, stay, False
+        self._duration_s, self._stays = duration_s, stay
+        self._began_s, self._accepted = np.nan, False
         self.n_goals, self.n_taken = len(self._goals), 0
-        self._search: GoalSearch | None = None
 
-    def advance(self, state: LoopState, now_s: float, row: int, note: Note) -> LoopState | None:
-        """Return the state with the goal of a tick, None where the run is over.
-
-        Args:
-            state: after the last tick.
-            now_s: time.
-            row: of the log.
-            note: takes the refusals of goals.
-        """
+    def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
+        """Go on to the next accepted goal where there is none; end after the last one, or the duration."""
         self._began_s = now_s if np.isnan(self._began_s) else self._began_s
-        state = self.taken(state, note)
+        state, events = self.take_next(state)
         over = self._duration_s is not None and now_s - self._began_s >= self._duration_s
         ended = state.goal is None and self.n_taken == len(self._goals)
-        return None if over or (ended and not (self._stays and self._accepted)) else state
+        over |= ended and not (self._stays and self._accepted)
+        return None if over else state, events
 
-    def go_on(self, controller: Controller, search: GoalSearch, state: LoopState) -> LoopState:
-        """Take another controller and its search; return the state that begins its goal again."""
-        self._controller, self._search = controller, search
-        self.n_taken -= state.goal is not None
-        return state._replace(goal=None)
-
-    def taken(self, state: LoopState, note: Note) -> LoopState:
-        """Return the state with the next accepted goal, if it has none; without during a search."""
+    def take_next(self, state: LoopState) -> tuple[LoopState, Events]:
+        """Return the state with the next accepted goal, if it has none, and the refusals until then."""
+        refusals = []
         while state.goal is None and self.n_taken < len(self._goals):
             goal, refusal = self._goals[self.n_taken], self._refused.get(self.n_taken)
-            if self._search and not refusal:
-                if not self._search.step(goal):
-                    return state
-                refusal = self._search.refusal()
             self.n_taken += 1
-            events = (refusal,) if refusal else ()
-            if not refusal:
-                state, events = with_goal(self._controller, state, goal)
+            if refusal:
+                refusals.append(refusal)
+                continue
+            state, events = with_goal(self._controller, state, goal)
             self._accepted |= not events
-            note(events)
-        return state
-
-
-class Orders(NamedTuple):
-    """Orders for the next tick; of several, the safest one counts."""
-
-    vent: bool = False  # let the pressures go to zero; a later goal brings the arm up again
-    hold: bool = False  # give up the goals and hold the springs where they are
-    goals: Sequence[np.ndarray] | None = None  # poses (6,) [mm, deg] that replace all others; None: no change
-
-
-class Pilot(Protocol):
-    """Interface of a pilot, who steers an arm. Both methods run within a tick: neither may wait."""
-
-    def orders(self) -> Orders:
-        """Return the orders since the last tick."""
-        ...
-
-    def look(self, state: LoopState, tick: Tick, row: dict[str, Any]) -> None:
-        """Take a tick: the state after it, its results, and the row that it logged."""
-        ...
+            refusals += events
+        return state, tuple(refusals)
 
 
 class OrderedGoals(ListedGoals):
-    """Goals that a pilot orders; they are not counted, and only the pilot ends the run."""
+    """Goals that somebody orders; they are not counted, and only an exception of `orders` ends the run."""
 
-    def __init__(self, controller: Controller, pilot: Pilot):
+    def __init__(self, controller: Controller, orders: Callable[[], Order]):
         super().__init__(controller, (), {})
-        self._pilot = pilot
+        self._orders = orders
 
-    def advance(self, state: LoopState, now_s: float, row: int, note: Note) -> LoopState:
-        """Obey the orders since the last tick."""
-        orders = self._pilot.orders()
-        if orders.vent or orders.hold:
+    def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
+        """Obey the order since the last tick."""
+        order = self._orders()
+        if isinstance(order, str):
             self._goals, self.n_taken = [], 0
-            state = release(state) if orders.vent else hold(state)
-        elif orders.goals is not None:
-            self._goals, self.n_taken = list(orders.goals), 0
+            state = {"vent": release, "hold": hold}[order](state)
+        elif order is not None:
+            self._goals, self.n_taken = list(order), 0
             state = state._replace(goal=None)
-        return self.taken(state, note)
+        return self.take_next(state)
+
+
+class MovingGoal:
+    """Goal that moves past poses (p, 6), two or more, from stop to stop, as `trace` takes them.
+
+    It leaves a stop once the arm answers, some time after the arrival there: see `lead_of`. It does not begin
+    to move if any pose is refused.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        goals: np.ndarray,
+        stops: np.ndarray,
+        pace_s: float,
+        refused: Mapping[int, Event],
+    ):
+        self._controller, self._poses, self._pace_s = controller, np.asarray(goals, float), pace_s
+        self._lead_s, self._start_s = lead_of(controller)  # before the arm moves: it may take seconds
+        self._refused = refused
+        self._stops = np.union1d(np.flatnonzero(stops), [0, len(goals) - 1])
+        self._began_s, self._leg = 0.0, self._poses
+        self.n_goals, self.n_taken, self.ways = len(self._stops), 0, list[slice]()
+
+    def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
+        """Move the goal, from an arrival at a stop until the goal is at the next."""
+        if self._refused:
+            return None, tuple(self._refused.values())
+        if state.goal is None and self.n_taken == len(self._poses):
+            return None, ()
+
+        # Leave a stop, or go to the first one.
+        if state.goal is None:
+            k = self.n_taken - 1
+            stop = int(self._stops[self._stops > k][0])
+            self.n_taken = stop + 1
+            if k < 0:
+                return self._stop(state)
+            self._began_s, self._leg = now_s + self._start_s, self._poses[k : stop + 1]
+            self.ways.append(slice(row, row))
+        elif state.ahead is None:
+            return state, ()
+
+        # Go on, or stop; the way's rows begin as the goal leaves the stop.
+        stands = now_s < self._began_s + 0.5 * self._controller.dt_s
+        self.ways[-1] = slice(row if stands else self.ways[-1].start, row)
+        if now_s - self._began_s >= self._pace_s * (len(self._leg) - 1):
+            return self._stop(state)
+        strategy = state.strategy
+        if state.ahead is None:  # it has just left the stop
+            strategy = to_moving_goal(self._controller.policy, self._lead_s)
+        goal, ahead = self._place(now_s), self._place(now_s + self._lead_s)
+        return state._replace(goal=goal, ahead=ahead, strategy=strategy), ()
+
+    def _stop(self, state: LoopState) -> tuple[LoopState | None, Events]:
+        """Return the state with the next stop as its goal; None where it is refused."""
+        state, events = with_goal(self._controller, state, self._poses[self.n_taken - 1])
+        return None if events else state, events
+
+    def _place(self, now_s: float) -> np.ndarray:
+        """Return the place (6,) [mm, deg] of the goal at a time."""
+        return on_the_way(self._leg, (now_s - self._began_s) / (self._pace_s * (len(self._leg) - 1)))
+
+
+def on_the_way(goals: np.ndarray, share: float) -> np.ndarray:
+    """Return the pose (6,) [mm, deg] after a share of the way past goals (p, 6); its ends beyond 0 and 1."""
+    passed = min(max(share, 0.0), 1.0) * (len(goals) - 1)
+    k = min(int(passed), len(goals) - 2)
+    return goals[k] + (passed - k) * pose_error(goals[k + 1], goals[k])

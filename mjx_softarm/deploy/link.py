@@ -21,11 +21,12 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.deploy.arm_io import ArmIO, Capture
-from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
+LOST_TICKS = 3  # ticks in a row without a reading after which a sensor counts as lost; by hand
+LATE_TICKS = 5  # late ticks in a row after which the arm counts as late; by hand
 VENT_KPA_PER_S = 20.0  # ramp to zero; by hand
 VENT_TRIES = 250  # failed writes in a row after which the arm counts as not vented; some 5 s, by hand
 LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
@@ -103,7 +104,7 @@ class Link:
             self._call("write_pressures", lambda: self._arm.write_pressures(pressure_kpa))
         except TimeoutError as error:
             self._n_late += 1
-            most = 2 * LOOP.late_ticks
+            most = 2 * LATE_TICKS
             if self._n_late > most:
                 raise ArmFault(
                     f"write_pressures: got {self._n_late} late in a row, expected {most} at most"

@@ -5,8 +5,8 @@
     belief, goal        -> references    if an action is due (`mjx_softarm.deploy.strategy`)
     belief, references  -> pressures     the sensor-space law (`mjx_softarm.control`)
 
-Each piece has a memory of its own; `LoopState` holds them side by side. Gains, limits, calibration, rate,
-tolerance and number of actions come from the policy file, heuristics from `LoopConfig`.
+Belief, strategy and command are values, which `LoopState` holds side by side. Gains, limits, calibration,
+rate, tolerance and number of actions come from the policy file; heuristics are constants beside their use.
 """
 
 from __future__ import annotations
@@ -20,12 +20,10 @@ from mjx_softarm.control import LawState, pressures
 from mjx_softarm.deploy.belief import Belief, believe
 from mjx_softarm.deploy.controller import Command, Controller
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.moving.strategy import to_moving_goal
-from mjx_softarm.deploy.safety import Event, Fault, Watch, check, stop_of
+from mjx_softarm.deploy.safety import Event, Fault, check, stop_of
 from mjx_softarm.deploy.strategy import Strategy, to_fixed_goal
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.reach import nearest_poses
-from mjx_softarm.policy.reachable import nearest
+from mjx_softarm.policy.reach import nearest, nearest_poses
 
 
 class LoopState(NamedTuple):
@@ -33,29 +31,16 @@ class LoopState(NamedTuple):
 
     command: Command
     belief: Belief
-    watch: Watch
-    strategy: Strategy
+    strategy: Strategy | None = None  # None without a goal
     goal: np.ndarray | None = None  # (6,) [mm, deg]
-    lead: np.ndarray | None = None  # (6,) [mm, deg] place of a moving goal ahead; None: the goal stands
-
-
-class Tick(NamedTuple):
-    """Results of a tick besides the next state."""
-
-    events: tuple[Event, ...]
-    arrived: bool  # the springs have settled, and no further action is due
-
-    @property
-    def stop(self) -> Event | None:
-        """First event that ends the run, if there is one."""
-        return stop_of(self.events)
+    ahead: np.ndarray | None = None  # (6,) [mm, deg] place of a moving goal ahead; None: the goal stands
+    arrived: bool = False  # the springs have settled in this tick, and no further action is due
 
 
 def start(controller: Controller) -> LoopState:
     """Return the state before the first tick, of an arm without pressure."""
-    belief, spec = Belief.none(controller), controller.policy.spec
-    watch = Watch(0, np.zeros(spec.n_springs, int), np.zeros(spec.n_chambers, int), belief.load.kg)
-    return LoopState(belief.command, belief, watch, to_fixed_goal(controller.policy))
+    belief = Belief.none(controller)
+    return LoopState(belief.command, belief)
 
 
 def step(
@@ -64,7 +49,7 @@ def step(
     readings: np.ndarray | None,
     late: bool,
     measured_kpa: np.ndarray | None = None,
-) -> tuple[LoopState, Tick]:
+) -> tuple[LoopState, tuple[Event, ...]]:
     """Take one tick.
 
     Args:
@@ -75,27 +60,28 @@ def step(
         measured_kpa (n_chambers,) [kPa]: measured pressures; NaN, or None for all, where none was measured.
 
     Returns:
-        The next state, whose pressures are to be written unless the tick says stop, and the tick.
+        The next state, and the faults; its pressures are to be written unless a fault ends the run.
     """
-    belief = believe(controller, state.belief, state.command, readings, measured_kpa)
-    watch, events = check(controller, state.watch, belief, late)
-    state = state._replace(belief=belief, watch=watch)
+    belief = believe(controller, state.belief, state.command, readings, late, measured_kpa)
+    events = check(state.belief, belief)
+    state = state._replace(belief=belief, arrived=False)
     if stop_of(events) is not None:
-        return state, Tick(events, arrived=False)
+        return state, events
 
     # References, if each spring was read
-    arrived = False
-    if state.goal is not None and belief.known and not belief.lost.any():
-        goal = state.goal if state.lead is None else state.lead
-        strategy, reference_m, found, arrived = state.strategy.references(belief, goal)
-        state = state._replace(strategy=strategy, goal=None if arrived else state.goal)
+    if state.strategy is not None and state.goal is not None and belief.known and not belief.lost.any():
+        goal = state.goal if state.ahead is None else state.ahead
+        strategy, reference_m, more = state.strategy.references(belief, goal)
+        events += more
+        state = state._replace(strategy=strategy)
+        if strategy is None:
+            state = state._replace(goal=None, arrived=True)
         if reference_m is not None:
             state = state._replace(command=state.command._replace(reference_m=reference_m, n_ticks=0))
-        events += found
 
     # Pressures
     command = _pressed(controller, state.command, belief.spring_m)
-    return state._replace(command=command), Tick(events, arrived)
+    return state._replace(command=command), events
 
 
 def _pressed(controller: Controller, command: Command, spring_m: np.ndarray) -> Command:
@@ -132,16 +118,7 @@ def with_goal(
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
     strategy = to_fixed_goal(controller.policy)
     command = state.command._replace(n_ticks=0)
-    return state._replace(goal=goal, lead=None, strategy=strategy, command=command), ()
-
-
-def with_moving_goal(
-    controller: Controller, state: LoopState, goal: np.ndarray, lead: np.ndarray
-) -> LoopState:
-    """Return the state with the places (6,) [mm, deg] of a moving goal, now and ahead; all are reachable."""
-    begins = state.lead is None
-    strategy = to_moving_goal(controller.policy) if begins else state.strategy
-    return state._replace(goal=goal, lead=lead, strategy=strategy)
+    return state._replace(goal=goal, ahead=None, strategy=strategy, command=command), ()
 
 
 def hold(state: LoopState) -> LoopState:
@@ -169,15 +146,15 @@ def refusals(policy: Policy, goals: Sequence[np.ndarray]) -> dict[int, Event]:
     if not finite:
         return {}
     poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
-    told = zip(finite, poses, errors, strict=True)
-    found = {k: refusal(policy, goals[k], pose, error) for k, pose, error in told}
-    return {k: event for k, event in found.items() if event}
+    return {
+        k: _unreachable(goals[k], pose)
+        for k, pose, error in zip(finite, poses, errors, strict=True)
+        if error > policy.reward.threshold or np.isnan(error)
+    }
 
 
-def refusal(policy: Policy, goal: np.ndarray, pose: np.ndarray, error: float) -> Event | None:
-    """Return the refusal of a goal (6,) whose nearest pose (6,) [mm, deg] has too large a weighted error."""
-    if error <= policy.reward.threshold:  # not for NaN
-        return None
+def _unreachable(goal: np.ndarray, pose: np.ndarray) -> Event:
+    """Return the refusal of a goal (6,) with its nearest pose (6,) [mm, deg]."""
     got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goal, pose))
     message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
     return Event(Fault.GOAL_OUTSIDE, message)

@@ -15,17 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.belief import stuck_springs
-from mjx_softarm.deploy.controller import LOOP
+from mjx_softarm.deploy.belief import LOST_SHARE, STUCK_PRESSURE_KPA, stuck_springs
 from mjx_softarm.deploy.drive import Drive, ramp
 from mjx_softarm.deploy.ending import Ending, vent_at_end
 from mjx_softarm.deploy.link import ArmFault, Recorder, stacked
 from mjx_softarm.logs.checks import same_sign
 from mjx_softarm.logs.rest import MIN_HOLD_S, NEEDED, ROUNDING_S, WINDOW_S, leaves, moves
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
 from mjx_softarm.spec import ArmSpec
 
-TIMEOUT_S = LOOP.settle_timeout_s + MIN_HOLD_S + WINDOW_S
+TIMEOUT_S = SETTLE_TIMEOUT_S + MIN_HOLD_S + WINDOW_S
 PROGRESS_S = 10.0  # between lines of progress
 UNSEEN_POSES = 3  # poses in a row without a frame of motion capture after which it counts as gone; by hand
 
@@ -145,9 +145,8 @@ class _Hold:
             raise ArmFault(f"spring{stuck[0]}: got the same reading always, expected one that changes")
         if target_kpa is None:
             return
-        off = np.abs(kpa[-1] - target_kpa) > np.maximum(
-            LOOP.stuck_pressure_kpa, LOOP.lost_share * np.abs(target_kpa)
-        )
+        least_kpa = np.maximum(STUCK_PRESSURE_KPA, LOST_SHARE * np.abs(target_kpa))
+        off = np.abs(kpa[-1] - target_kpa) > least_kpa
         if (k := np.flatnonzero(off)).size:
             got, wanted = kpa[-1, k[0]], target_kpa[k[0]]
             raise ArmFault(f"pressures: chamber{k[0]}: got {got:.1f} kPa at rest, expected {wanted:.1f} kPa")

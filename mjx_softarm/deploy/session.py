@@ -7,27 +7,60 @@ capture, and uses measured pressures only to estimate the payload.
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import Arrival, LoopRun, vent_at_end
-from mjx_softarm.deploy.goals import ListedGoals, OrderedGoals, Pilot
+from mjx_softarm.deploy.ending import DONE, MISSED, Ending, vent_at_end
+from mjx_softarm.deploy.goals import Goals, ListedGoals, MovingGoal, Order, OrderedGoals
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, step
-from mjx_softarm.deploy.lost import begun_again, without
-from mjx_softarm.deploy.moving.way import Way
-from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, lost_chambers, names
+from mjx_softarm.deploy.loop import LoopState, in_force, refusals, start, step
+from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, stop_of
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import weighted_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
 
 _ROUNDING_S = 1e-6  # rounding error of a simulated tick's duration
 _KEPT = 1000  # number of rows, arrivals and faults that a run without a log keeps
+
+
+class Arrival(NamedTuple):
+    """An arrival: the springs have settled after the last action towards a goal."""
+
+    goal: np.ndarray  # (6,) [mm, deg]
+    estimate: np.ndarray  # (6,) [mm, deg] believed pose
+    row: int  # index of the log's row
+    index: int  # index of the goal in the list of goals
+    reached: bool = True  # within the policy's threshold of a goal, by motion capture if there is any
+
+
+class LoopRun(NamedTuple):
+    """Results of a run of the control loop."""
+
+    log: Log
+    arrivals: tuple[Arrival, ...]
+    events: tuple[Event, ...]
+    latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
+    ending: Ending
+    n_goals: int = 0  # number of goals that count; 0 in `steer`
+    ways: tuple[slice, ...] = ()  # rows of the log in which the goal moved
+
+    def counts(self) -> dict[Fault, int]:
+        """Return the number of events of each fault."""
+        return dict(Counter(event.fault for event in self.events))
+
+    @property
+    def status(self) -> int:
+        """Exit status of the ending; after a good one `MISSED` if a goal was not reached or was refused.
+
+        Goals of `steer` do not count.
+        """
+        n_reached = sum(arrival.reached for arrival in self.arrivals)
+        return self.ending.status or (MISSED if n_reached < self.n_goals else DONE)
 
 
 def follow(
@@ -79,23 +112,32 @@ def trace(
         tell, arrived, save: as for `follow`; stops are the goals that count.
     """
     refused = refusals(controller.policy, list(goals))
-    way = Way(controller, goals, np.broadcast_to(stops, len(goals)), pace_s, refused)
-    return _Session(arm, controller, way, tell, arrived).to_end(save)
+    goal = MovingGoal(controller, goals, np.broadcast_to(stops, len(goals)), pace_s, refused)
+    return _Session(arm, controller, goal, tell, arrived).to_end(save)
 
 
 def steer(
     arm: Any,
     controller: Controller,
-    pilot: Pilot,
+    orders: Callable[[], Order],
+    look: Callable[[LoopState, dict[str, Any]], None] = lambda state, row: None,
     tell: Callable[[str], None] = lambda text: None,
     save: Callable[[Log], None] | None = None,
 ) -> LoopRun:
-    """Steer an `ArmIO` by a pilot's orders until something ends the run, then vent; see `follow`.
+    """Steer an arm by somebody's orders until something ends the run, then vent.
 
     Without `save` only the newest rows, arrivals and faults are kept: the run may last for days.
+
+    Args:
+        arm: an `ArmIO` without pressure, as its driver gives it.
+        controller: the policy.
+        orders: returns the order for the next tick: "vent", "hold", goals (6,) [mm, deg] that replace all
+            others, or None; called in each tick, so it may not wait.
+        look: takes the state after each tick and the row that it logged; may not wait.
+        tell, save: as for `follow`.
     """
-    source, kept = OrderedGoals(controller, pilot), None if save else _KEPT
-    session = _Session(arm, controller, source, tell, look=pilot.look, kept=kept)
+    goals, kept = OrderedGoals(controller, orders), None if save else _KEPT
+    session = _Session(arm, controller, goals, tell, look=look, kept=kept)
     return session.to_end(save or (lambda log: None))
 
 
@@ -106,10 +148,10 @@ class _Session:
         self,
         arm: ArmIO,
         controller: Controller,
-        goals: ListedGoals | Way,
+        goals: Goals,
         tell: Callable[[str], None],
         arrived: Callable[[int], None] = lambda goal: None,
-        look: Callable[[LoopState, Tick, dict[str, Any]], None] = lambda state, tick, row: None,
+        look: Callable[[LoopState, dict[str, Any]], None] = lambda state, row: None,
         kept: int | None = None,
     ):
         self.controller, self.goals = controller, goals
@@ -142,7 +184,9 @@ class _Session:
         try:
             while True:
                 begin_s = self.link.now()
-                state = self.goals.advance(self.state, begin_s, len(self.rows), self._note)
+                state, refused = self.goals.advance(self.state, begin_s, len(self.rows))
+                if refused:
+                    self._note(refused)
                 if state is None:
                     return
                 self.state = state
@@ -171,37 +215,26 @@ class _Session:
         # Take a tick of the loop.
         began = time.perf_counter()
         try:
-            self.state, tick = step(self.controller, self.state, readings, self.late, row["pressure_kpa"])
+            self.state, events = step(self.controller, self.state, readings, self.late, row["pressure_kpa"])
         except Exception:  # the row that explains it is kept
             self._log(row)
             raise
         self.latency_s.append(time.perf_counter() - began)
 
         # Write the pressures.
+        stop = stop_of(events)
         try:
-            in_time = tick.stop is not None or self.link.write(self.state.command.pressure_kpa)
+            in_time = stop is not None or self.link.write(self.state.command.pressure_kpa)
             self.state = in_force(self.state, self.link.pressure_kpa)
         finally:  # the row is kept even if the pressures were refused; logging comes after them
             self._log(row)
-            self._note(tick.events, self.state.belief.estimate_kg is not None)
-            if tick.arrived:
+            self._note(events, self.state.belief.estimate_kg is not None)
+            if self.state.arrived:
                 self._arrive(row["goal"], row["estimate"])
-            self.look(self.state, tick, row)
-        if tick.stop is not None and not self._goes_on(tick.stop):
-            raise _Stopped(self._at(f"{tick.stop.fault.value}: {tick.stop.message}"))
+            self.look(self.state, row)
+        if stop is not None:
+            raise _Stopped(self._stamped(f"{stop.fault.value}: {stop.message}"))
         return in_time
-
-    def _goes_on(self, stop: Event) -> bool:
-        """Go on without the chamber that was lost, if the controller may and goals stand still."""
-        goals, may = self.goals, self.controller.config.go_on and stop.fault is Fault.CHAMBER_LOST
-        if not may or not isinstance(goals, ListedGoals):
-            return False
-        lost = lost_chambers(self.controller, self.state.watch, self.state.belief)
-        self.tell(self._at(f"{stop.fault.value}: {stop.message} -> go on without {names('chamber', lost)}"))
-        self.controller, search = without(self.controller, lost)
-        again = begun_again(self.controller, self.state)
-        self.state = goals.go_on(self.controller, search, again)
-        return True
 
     def _log(self, row: dict[str, Any]) -> None:
         belief, reference_m = self.state.belief, self.state.command.reference_m
@@ -210,13 +243,13 @@ class _Session:
         self.rows.add(row)
 
     def _note(self, events: Sequence[Event], estimated: bool = False) -> None:
-        """Count events, and tell those that are new in this tick; the end of the run tells why it vents.
+        """Count events, and report those that are new in this tick; the end of the run says why it vents.
 
         Faults of the payload last until it is next estimated; `estimated` says whether it was.
         """
         for event in events:
             if event.fault not in self.last and event.response is not Response.VENT:
-                self.tell(self._at(event))
+                self.tell(self._stamped(event))
         lasting = set() if estimated else self.last & PAYLOAD_FAULTS
         self.last = lasting | {event.fault for event in events}
         self.events.extend(events)
@@ -234,7 +267,7 @@ class _Session:
         if any(reward.asked[3:]):
             off += f"; yaw, pitch, roll {', '.join(f'{value:+.1f}' for value in asked[3:])} deg off"
         missed = "" if reached else f"; NOT REACHED, {share:.2f} times the error that a goal allows"
-        self.tell(self._at(f"goal {len(self.arrivals)}: {off}{missed}"))
+        self.tell(self._stamped(f"goal {len(self.arrivals)}: {off}{missed}"))
         self.arrived(self.goals.n_taken - 1)
 
     def _seen_error(self, goal: np.ndarray) -> np.ndarray:
@@ -245,7 +278,7 @@ class _Session:
         tip_m, quaternion = (np.array([row[name] for row in rows]) for name in ("tip_m", "tip_quaternion"))
         return seen_error(tip_m, quaternion, goal)
 
-    def _at(self, text: object) -> str:
+    def _stamped(self, text: object) -> str:
         return f"{len(self.rows) * self.controller.dt_s:.2f} s: {text}"
 
 

@@ -23,7 +23,6 @@ from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mechanics import mjx_rest
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.motion import midpoint, mjx_step
 from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm
@@ -249,9 +248,11 @@ class ReachEnv(brax_envs.Env):
         if config.moves:
             moving = MovingArm(self.model, self._data, params, arm.moving)
             times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
-            engine = midpoint if config.engine == "mjx" else mjx_step
-            return engine.advance(moving, arm.motion, reference_m, self.gains, *times_s)
-        end = settle(chain_kinematics(params), params, reference_m, self.n_at_once)
+            told = moving, arm.motion, reference_m, self.gains, *times_s
+            if config.engine == "mjx":
+                return midpoint.advance(*told, self.n_at_once)
+            return mjx_step.advance(*told)
+        end = settle(params, reference_m, self.n_at_once)
         if config.engine == "mjx":
             end = mjx_rest.measured(self.model, self._data, params, end)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end

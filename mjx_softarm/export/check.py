@@ -126,12 +126,12 @@ def without_memory(golden: Golden, answer: Callable) -> tuple[np.ndarray, dict[s
     for row in golden.inputs[rows].astype(np.float32):
         result = answer(row[len(FLAGS) : -6], row[-6:])
         acts = np.isfinite(result["reference_m"]).all()
-        found = {
+        present = {
             Fault.LOST_READING: result["reading_lost"].any(),
             Fault.GOAL_OUTSIDE: result["goal_outside"],
             Fault.EXTRAPOLATION: acts and result["extrapolation"] > 1.0,
         }
-        faults = sum(BITS[fault] for fault, there in found.items() if there)
+        faults = sum(BITS[fault] for fault, there in present.items() if there)
         nothing = np.full(golden.n_chambers, np.nan)
         values = nothing, result["reference_m"], result["length_m"], result["pose"]
         answers.append(np.concat([[faults, 0.0], *values]))
@@ -144,8 +144,8 @@ def _checked(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the golden rows with checked goals, and their faults; `outside` decides GOAL_OUTSIDE."""
     rows, bit = np.flatnonzero(golden.inputs[:, FLAGS.index("checked")]), BITS[Fault.GOAL_OUTSIDE]
-    found = np.array([bit * outside(goal) for goal in golden.inputs[rows, -6:].astype(np.float32)], int)
-    return rows, {"faults": golden.outputs[rows, 0].astype(int) & ~bit | found}
+    bits = np.array([bit * outside(goal) for goal in golden.inputs[rows, -6:].astype(np.float32)], int)
+    return rows, {"faults": golden.outputs[rows, 0].astype(int) & ~bit | bits}
 
 
 def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -8,14 +8,19 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import LawState, pressures, saturated
-from mjx_softarm.deploy.belief import as_without, hysteresis_after, on_reference, still, stuck_springs
+from mjx_softarm.deploy.belief import (
+    explained_by_pressure_loss,
+    hysteresis_after,
+    on_reference,
+    stuck_springs,
+)
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.rewards import asked_error, weighted_error
 from mjx_softarm.policy import reach
-from mjx_softarm.policy.reach import followed
-from mjx_softarm.policy.reachable import distances
+from mjx_softarm.policy.lag import still
+from mjx_softarm.policy.reach import distances, followed
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.sensors import Reading, SensorFault
@@ -173,23 +178,23 @@ def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]
 def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]:
     """Record rest, faults, and the way that remains."""
     # Rest and faults.
-    policy, config = controller.policy, controller.config
+    policy, rest = controller.policy, controller.rest
     gains, xp = policy.gains, array_namespace(at.pose)
-    settled = on_reference(at.springs_m, at.reference_m, at.pressure_kpa, gains, config)
+    settled = on_reference(at.springs_m, at.reference_m, at.pressure_kpa, gains, rest.arrived_m)
     mask = saturated(at.pressure_kpa, at.reference_m, at.spring_m, gains, policy.tolerance_m)
-    stuck = stuck_springs(at.springs_m, at.pressures_kpa, policy.spec.structure.n_sections, config)
-    without = as_without(policy.spring_model, at.pressure_kpa, at.spring_m, config, gains.allocation)
+    stuck = stuck_springs(at.springs_m, at.pressures_kpa, policy.spec.structure.n_sections)
+    lost = explained_by_pressure_loss(policy.spring_model, at.pressure_kpa, at.spring_m, gains.allocation)
     # Error of a pose, and lengths that references make.
     pose = xp.asarray(at.pose, dtype=np.float64)
     weighted = weighted_error(pose, at.goal, policy.reward)
     mean_m, asked_m = (symbol(name, at.spring_m.shape) for name in ("mean_m", "asked_m"))
     moved = at.reference_m, mean_m, asked_m, symbol("is_saturated", at.pressure_kpa.shape, bool)
     return {
-        "still": _of(at.springs_m, holds=still(at.springs_m, config)),
+        "still": _of(at.springs_m, holds=still(at.springs_m, rest.still_m)),
         "on_reference": _of(at.springs_m, at.reference_m, at.pressure_kpa, holds=settled),
         "saturated": _of(at.pressure_kpa, at.reference_m, at.spring_m, mask=mask),
         "stuck": _of(at.springs_m, at.pressures_kpa, mask=stuck),
-        "as_without": _of(at.pressure_kpa, at.spring_m, mask=without),
+        "as_without": _of(at.pressure_kpa, at.spring_m, mask=lost),
         "left": _of(at.pose, at.goal, off=asked_error(pose, at.goal, policy.reward), error=weighted),
         "followed": _of(*moved, lengths_m=followed(*moved, policy)),
     }

@@ -143,17 +143,17 @@ def repeat(step: Callable[[Symbol], Symbol], start: Symbol, n: int) -> Symbol:
 
 def ordered(results: Iterable[Symbol]) -> list[Symbol]:
     """Return the results and all symbols that they depend on, each after its operands."""
-    found: dict[Symbol, None] = {}
+    order: dict[Symbol, None] = {}
 
     def visit(item: Symbol) -> None:
-        if item not in found:
+        if item not in order:
             for operand in item.operands:
                 visit(operand)
-            found[item] = None
+            order[item] = None
 
     for result in results:
         visit(result)
-    return list(found)
+    return list(order)
 
 
 def _one(value: Any) -> Any:

@@ -13,8 +13,7 @@ from mjx_softarm._support.errors import needing
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import computations
 from mjx_softarm.export.cpp import sources
-from mjx_softarm.export.golden import Golden, write_golden
-from mjx_softarm.export.golden_cases import make_golden
+from mjx_softarm.export.golden import Golden, make_golden, write_golden
 from mjx_softarm.mdp.observation import RATE_S
 from mjx_softarm.policy.file import LAW, Policy, action_layout, load_policy
 from mjx_softarm.posture import straight_pose

@@ -11,11 +11,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
 N_ACTIONS = 4  # actions towards each goal, in evaluations and on the arm
+# Largest shift (6,) [mm, deg] of the goal that a policy is given to correct an error; by hand
+SHIFT_LIMIT = np.repeat([25.0, 5.0], 3)
 
 
 class ActionMap(NamedTuple):

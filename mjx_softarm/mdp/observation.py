@@ -114,7 +114,7 @@ def observe(pose: Array, goal: Array, scale: ObsScale, config: RewardConfig) -> 
     goal that is not asked for is not seen.
     """
     xp = array_namespace(pose)
-    here, there = (pose_error(value, scale.centre) / scale.scale for value in (pose, goal))
+    scaled_pose, scaled_goal = (pose_error(value, scale.centre) / scale.scale for value in (pose, goal))
     if not all(config.asked):
-        there = xp.where(np.array(config.asked), there, 0.0)
-    return xp.concat([here, there, scaled_error(pose, goal, config)], axis=-1)
+        scaled_goal = xp.where(np.array(config.asked), scaled_goal, 0.0)
+    return xp.concat([scaled_pose, scaled_goal, scaled_error(pose, goal, config)], axis=-1)

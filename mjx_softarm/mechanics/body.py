@@ -102,13 +102,13 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
     geometry = spec.geometry
     n_rings = spec.structure.links_per_section
     steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
-    at = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
+    shares = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
     spring_site_m = holes_m(spring_directions(spec), spec.per_section(geometry.spring_radius_m))
     base = Frame(np.array(spec.mounting.base_offset_m), base_rotation(spec))
-    sections = backbone(base, spring_site_m, spring_m, tip, at)
+    sections = backbone(base, spring_site_m, spring_m, tip, shares)
     rings, folds, coils = (
         Frame(*(part[:, rows] for part in sections))
-        for rows in np.split(np.arange(len(at)), [n_rings, n_rings + FOLDS])
+        for rows in np.split(np.arange(len(shares)), [n_rings, n_rings + FOLDS])
     )
 
     # Rings stand on the axis, folds and coils beside it

@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm._support.small_matrices import block_diagonal, eliminate, identity, product
+from mjx_softarm._support.small_matrices import block_diagonal, eliminate, identity, product, products
 
 
 class ChainHessian(NamedTuple):
@@ -30,6 +31,24 @@ class ChainHessian(NamedTuple):
     above: Array  # (n_sections, n, rank, *arms)
     below: Array  # (n_sections, n, rank, *arms)
 
+    @classmethod
+    def of_factors(cls, above: Array, below: Array) -> ChainHessian:
+        """Return the matrix whose entry (i, j) is row i of `above` times row j of `below`, for i not after j.
+
+        Both factors are (n_sections, n, rank, *arms).
+        """
+        earlier_first = products(above, jnp.swapaxes(below, 1, 2))
+        n = earlier_first.shape[1]
+        upper = jnp.tri(n, dtype=bool).T.reshape(n, n, *[1] * (above.ndim - 3))
+        own = jnp.where(upper, earlier_first, jnp.swapaxes(earlier_first, 1, 2))
+        return cls(own, above, below)
+
+    def plus(self, other: ChainHessian, times: float) -> ChainHessian:
+        """Return the sum with a multiple of another matrix."""
+        above = jnp.concatenate([self.above, other.above], axis=2)
+        below = jnp.concatenate([self.below, times * other.below], axis=2)
+        return ChainHessian(self.own + times * other.own, above, below)
+
     def dense(self) -> Array:
         """Return the whole matrix (nv, nv) of one arm."""
         n_sections, n, _ = self.own.shape
@@ -38,6 +57,15 @@ class ChainHessian(NamedTuple):
         further_down = section[:, None] < section
         far = jnp.where(further_down, product(above, below.T), 0)
         return block_diagonal(self.own) + far + far.T
+
+    def times(self, x: Array) -> Array:
+        """Return the product with a vector (nv, *arms)."""
+        column = x.reshape(*self.own.shape[:2], 1, *x.shape[1:])
+        up, down = (products(jnp.swapaxes(far, 1, 2), column) for far in (self.below, self.above))
+        up = jax.lax.cumsum(up, reverse=True) - up  # of all sections further down: (n_sections, rank, 1)
+        down = jnp.cumsum(down, axis=0) - down  # of all sections further up
+        far = products(self.above, up) + products(self.below, down)
+        return (products(self.own, column) + far).reshape(x.shape)
 
     def plus_diagonal(self, added: Array) -> ChainHessian:
         """Return the matrix with `added` (nv, *arms) on its diagonal."""
@@ -66,3 +94,18 @@ class ChainHessian(NamedTuple):
             found.append(solved[:, rank:] - product(solved[:, :rank], motion))
             motion = motion + product(jnp.swapaxes(above, 0, 1), found[-1])
         return jnp.stack(found)
+
+
+@jax.custom_vjp
+def solve_approximate_gradient(matrix: ChainHessian, columns: Array) -> Array:
+    """Multiply the inverse of a matrix by columns (n_sections, n, k, *arms), as `ChainHessian.solve`.
+
+    The gradient is approximate: it is by the columns alone, as if the matrix were a constant.
+    """
+    return matrix.solve(columns)
+
+
+solve_approximate_gradient.defvjp(
+    lambda matrix, columns: (matrix.solve(columns), matrix),
+    lambda matrix, d_found: (None, matrix.solve(d_found)),
+)

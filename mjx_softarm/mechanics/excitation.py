@@ -18,7 +18,7 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
 
     It favours the extremes, where the workspace ends. More than three independent chambers seldom push one
     way together. So every second set of such an arm has, in each section, a plane through the pressures of
-    three directions; the other sets tell the chambers apart.
+    three directions; the other sets distinguish the chambers.
 
     Args:
         spec: the arm.
@@ -56,8 +56,8 @@ def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
     evacuated = spec.chambers.pressure_min_kpa < 0.0
     height_mm = CIRCLE_HEIGHT_MM * size if evacuated else -1e3 * WITHOUT_VACUUM * spec.length_m
     radius, height = 0.5 * CIRCLE_DIAMETER_MM * size, np.full(n, height_mm)
-    at = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
-    return turned_poses(spec, at).astype(np.float32)
+    place_mm = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
+    return turned_poses(spec, place_mm).astype(np.float32)
 
 
 def growing(pressure_kpa: np.ndarray) -> np.ndarray:

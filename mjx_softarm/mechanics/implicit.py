@@ -18,7 +18,7 @@ of the law's gain l as well, where chambers track. They are at rest, but the joi
 
     dq = K dp + H^-1 S^T l (dreference - d_x s) - H^-1 d_x grad V,    with r less S times the last two terms.
 
-Redundant chambers close the errors of `mjx_softarm.mechanics.newton`: C S in place of S,
+Redundant chambers close the errors of `mjx_softarm.mechanics.settle`: C S in place of S,
 C (dreference - d_x s) in place of dreference - d_x s, and C S K + YIELD_M_PER_KPA N in place of S K.
 
 This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step; only
@@ -35,7 +35,7 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from mjx_softarm._support.small_matrices import block_diagonal, eliminate
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import Statics, statics
 
@@ -69,41 +69,41 @@ class Equilibrium(NamedTuple):
     law_response: Array  # (nv, n_springs) joints by references, zeros unless the law holds the arm
 
 
-def gain_columns(here: Statics, held: Array, params: ArmParams) -> Array:
+def gain_columns(potential: Statics, held: Array, params: ArmParams) -> Array:
     """Return forces (n_sections, n, n_springs, *arms) on the joints by references, through the law's gains.
 
     H^-1 times these forces is `Equilibrium.law_response`. They are zeros for redundant chambers, which are
     not held.
 
     Args:
-        here: at the equilibrium, the gains included.
+        potential: at the equilibrium, the gains included.
         held (n_chambers, *arms): bool, chambers whose gains take part.
         params: numbers of the arm.
     """
-    n_sections, _, n, *arms = here.springs.jacobian.shape
+    n_sections, _, n, *arms = potential.springs.jacobian.shape
     if params.allocation is not None:
-        return jnp.zeros((n_sections, n, *here.springs.length.shape), here.gradient.dtype)
+        return jnp.zeros((n_sections, n, *potential.springs.length.shape), potential.gradient.dtype)
     gain = jnp.where(held, params.law_stiffness, 0.0).reshape(n_sections, -1, 1, *arms)
-    columns = block_diagonal(jnp.swapaxes(gain * here.springs.jacobian, 1, 2))
+    columns = block_diagonal(jnp.swapaxes(gain * potential.springs.jacobian, 1, 2))
     return columns.reshape(n_sections, n, -1, *arms)
 
 
 def equilibrium_tangents(
-    primals: tuple, tangents: tuple, end: Equilibrium, settled: Array
+    primals: tuple, tangents: tuple, equilibrium: Equilibrium, settled: Array
 ) -> EquilibriumTangents:
     """Differentiate an equilibrium along a direction.
 
     Args:
-        primals: kinematics, params (`ArmParams`) and reference_m (n_springs,) of `settle`.
+        primals: params (`ArmParams`) and reference_m (n_springs,) of `settle`.
         tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
-        end: the equilibrium.
+        equilibrium: the equilibrium.
         settled () bool: false for a zero derivative.
     """
     # Derivatives at fixed joint coordinates and pressures
-    _, params, reference = primals
-    _, params_dot, reference_dot = tangents
-    q, pressure_kpa, at_limit, frames, here, response, by_law = end
-    explicit = _explicit_tangents(primals, tangents, q, pressure_kpa)
+    params, reference = primals
+    params_dot, reference_dot = tangents
+    q, pressure_kpa, at_limit, frames, potential, response, law_response = equilibrium
+    explicit = _explicit_tangents(params, params_dot, q, pressure_kpa)
 
     # Inverse of the chambers' equations
     dq_dp = _masked(response.dq_dp, settled)
@@ -119,12 +119,12 @@ def equilibrium_tangents(
     if explicit is not None:
         tracking_dot = tracking_dot - explicit.spring_m
     # Joints at constant pressures; the law's gain, where it holds the arm, answers to references at once
-    dq_held = jnp.sum(_masked(by_law, settled) * tracking_dot, axis=-1)
+    dq_held = jnp.sum(_masked(law_response, settled) * tracking_dot, axis=-1)
     if explicit is not None:
         every = jnp.eye(len(q), dtype=q.dtype).reshape(params.n_sections, -1, len(q))
-        compliance = _masked(here.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
+        compliance = _masked(potential.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
         dq_held = dq_held - jnp.sum(compliance * explicit.gradient, axis=-1)
-    tracking_dot = tracking_dot - _along(here.springs.jacobian, dq_held)
+    tracking_dot = tracking_dot - _along(potential.springs.jacobian, dq_held)
     if params.allocation is not None:
         tracking_dot = params.allocation.chamber_error @ tracking_dot
     limit_dot = jax.lax.select(at_high, high_dot, low_dot)
@@ -134,12 +134,12 @@ def equilibrium_tangents(
     dp = jnp.sum(inverse * right, axis=-1)
     dq = jnp.sum(dq_dp * dp, axis=-1) + dq_held
     tip_dot, rotation_dot = _tip_tangents(frames, dq)
-    spring_dot = _along(here.springs.jacobian, dq)
+    spring_dot = _along(potential.springs.jacobian, dq)
     if explicit is not None:
         spring_dot = spring_dot + explicit.spring_m
         tip_dot, rotation_dot = tip_dot + explicit.tip_position_m, rotation_dot + explicit.tip_rotation
-    found = EquilibriumTangents(dq, dp, spring_dot, tip_dot, rotation_dot)
-    return EquilibriumTangents(*(_masked(x, settled) for x in found))
+    result = EquilibriumTangents(dq, dp, spring_dot, tip_dot, rotation_dot)
+    return EquilibriumTangents(*(_masked(x, settled) for x in result))
 
 
 class _Explicit(NamedTuple):
@@ -151,11 +151,13 @@ class _Explicit(NamedTuple):
     tip_rotation: Array  # (3, 3)
 
 
-def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: Array) -> _Explicit | None:
+def _explicit_tangents(
+    params: ArmParams, params_dot: ArmParams, q: Array, pressure_kpa: Array
+) -> _Explicit | None:
     """Differentiate along the arm's numbers, pressure limits aside; None where none of them changes."""
     # Numbers that change; all others stay constants of the differentiated function
-    numbers, structure = jax.tree.flatten(_without_limits(primals))
-    directions = jax.tree.leaves(_without_limits(tangents))
+    numbers, structure = jax.tree.flatten(_without_limits(params))
+    directions = jax.tree.leaves(_without_limits(params_dot))
     changing = [k for k, direction in enumerate(directions) if not isinstance(direction, SymbolicZero)]
     if not changing:
         return None
@@ -164,18 +166,19 @@ def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: 
         merged = list(numbers)
         for k, value in zip(changing, values, strict=True):
             merged[k] = value
-        kinematics, params = jax.tree.unflatten(structure, merged)
-        frames = kinematics(q)
-        here = statics(frames, q, pressure_kpa, params)
-        return _Explicit(here.gradient, here.springs.length, frames.tip_position, frames.tip_rotation)
+        arm = jax.tree.unflatten(structure, merged)
+        frames = chain_kinematics(arm)(q)
+        potential = statics(frames, q, pressure_kpa, arm)
+        return _Explicit(
+            potential.gradient, potential.springs.length, frames.tip_position, frames.tip_rotation
+        )
 
     return jax.jvp(observables, [numbers[k] for k in changing], [directions[k] for k in changing])[1]
 
 
-def _without_limits(arguments: tuple) -> tuple:
-    """Return kinematics and parameters without the numbers that V does not contain."""
-    kinematics, params, _ = arguments
-    return kinematics, params._replace(pressure_min_kpa=None, pressure_max_kpa=None, allocation=None)
+def _without_limits(params: ArmParams) -> ArmParams:
+    """Return parameters without the numbers that V does not contain."""
+    return params._replace(pressure_min_kpa=None, pressure_max_kpa=None, allocation=None)  # type: ignore
 
 
 def _array(tangent: Array | SymbolicZero, primal: Array) -> Array:

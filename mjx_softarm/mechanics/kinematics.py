@@ -12,7 +12,7 @@ Many arms come last in every shape, (..., *arms): one instruction then serves se
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,22 +38,10 @@ class Frames(NamedTuple):
     tip_rotation: Array  # (3, 3, *arms)
 
 
-class Kinematics(Protocol):
-    """Kinematics of one engine: a pytree of the numbers that the frames depend on."""
-
-    arms_last: ClassVar[bool]  # takes many arms (nv, *arms) at once; else one arm (nv,)
-
-    def __call__(self, q: Array) -> Frames:
-        """Return the frames at joint coordinates (nv, *arms) [m, rad, rad]."""
-        ...
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ChainKinematics:
     """Closed form: products of the links' rotations, sums of the links' vectors."""
-
-    arms_last: ClassVar[bool] = True
 
     link_length_m: Array | np.ndarray  # (n_links, *arms) distance of a link's plates at rest
     mount: Mount = LEVEL

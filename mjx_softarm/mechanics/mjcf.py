@@ -150,9 +150,9 @@ def _add_holes(body, plate: int, section: int, position, params: ArmParams) -> N
     """Add the sites that the chambers and springs of `section` pass on a plate."""
     for kind, site_m in (("chamber", params.chamber_site_m), ("spring", params.spring_site_m)):
         n = site_m.shape[1]
-        for k, at in enumerate(site_m[section]):
+        for k, place in enumerate(site_m[section]):
             name = f"{kind}{section * n + k}_plate{plate}"
-            body.add_site(name=name, pos=position + [*at, 0.0], size=[0.001] * 3)
+            body.add_site(name=name, pos=position + [*place, 0.0], size=[0.001] * 3)
 
 
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:

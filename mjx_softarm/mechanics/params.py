@@ -16,8 +16,7 @@ from mjx_softarm.mechanics.pipe import Contact
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
-from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import LEAST_CHAMBERS, bonded_stiffness
+from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec, bonded_stiffness
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
@@ -87,7 +86,7 @@ class ArmParams(NamedTuple):
         limit = jnp.full_like(self.area, jnp.inf)
         return self._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
 
-    def answering(self, held: Array, reference_m: Array) -> ArmParams:
+    def with_law_gain(self, held: Array, reference_m: Array) -> ArmParams:
         """Return the arm with the law's proportional gain as springs about the references, where `held`.
 
         This changes no equilibrium at which these springs are on their references, but it may make it stable.

@@ -1,13 +1,14 @@
 """The quasi-static arm: spring references or pressures -> equilibrium under the sensor-space law.
 
 The law of `mjx_softarm.control` has integral action, so at rest each chamber has closed its error or is at a
-pressure limit. With the potential V of `mjx_softarm.mechanics.statics` and the errors e of
-`mjx_softarm.mechanics.newton`, rest is
+pressure limit. With the potential V of `mjx_softarm.mechanics.statics` and the errors e, rest is
 
     grad V(q; p) = 0,    e_t(q, p) = 0  or  p_t = limit   for every chamber t,
 
 solved by Newton's method on the active set: chambers whose p + c e leaves the limits are held there, the
-others track, and one linear system gives the step in q and p together.
+others track, and one linear system gives the step in q and p together. Without an allocation, each chamber
+closes the error of its spring, e = reference - s. Redundant chambers close
+e = C (reference - s) - YIELD_M_PER_KPA N p, with the matrices C and N of `mjx_softarm.control`.
 
 An arm that would buckle at constant pressures may stand under the law, whose proportional gain answers to a
 spring's error at once. Where V is not convex, this gain takes part as springs about the references.
@@ -28,12 +29,19 @@ from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.errors import Result
-from mjx_softarm.mechanics.contact import is_jammed
-from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
-from mjx_softarm.mechanics.newton import End, Iterate, law_errors, newton_pass
+from mjx_softarm._support.small_matrices import eliminate, identity, product, products
+from mjx_softarm.control import YIELD_M_PER_KPA, Allocation
+from mjx_softarm.mechanics.contact import is_jammed, step_share
+from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents, gain_columns
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.statics import Statics, statics
 
+MAX_ITERATIONS = 12
+MAX_ITERATIONS_IN_CONTACT = 36  # balls come to the wall one after another
+ACTIVE_SET_GAIN_KPA_PER_M = 1000.0  # c
+MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
+SMALL_STEP = 3e-4  # [m, rad]; Newton's method converges quadratically from here
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
 ARMS_IN_CACHE, CACHED_DOFS = 128, 36  # arms whose numbers a CPU's cache holds, and their joint coordinates
@@ -88,10 +96,8 @@ def arms_at_once(n_links: int) -> int | None:
     return ARMS_IN_VECTOR * max(1, round(in_cache / ARMS_IN_VECTOR))
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def settle(
-    kinematics: Kinematics, params: ArmParams, reference_m: Array, n_at_once: int | None = None
-) -> Settled:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def settle(params: ArmParams, reference_m: Array, n_at_once: int | None = None) -> Settled:
     """Find the equilibrium under the sensor-space law, starting from the straight arm.
 
     Joint coordinates, pressures, springs and tip are differentiable in all arguments, forward and in reverse,
@@ -99,36 +105,33 @@ def settle(
     fields have a zero derivative. An arm that did not settle has a zero derivative in every field.
 
     Args:
-        kinematics: of either engine, `chain_kinematics(params)` or `MjxKinematics(model)`.
         params: numbers of the arm.
         reference_m (n_springs,): spring lengths that the law tracks.
         n_at_once: arms of a `jax.vmap` that settle at once, from `arms_at_once`; None is all of them.
     """
-    return _solver(1, n_at_once)(kinematics, params, reference_m)[0]
+    return _solver(1, n_at_once)(params, reference_m)[0]
 
 
 def _settle_jvp(n_at_once: int | None, primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
     # A second small step brings the response, which is that before the last step, up to date
-    found, end = _solver(2, n_at_once)(*primals)
+    settled, equilibrium = _solver(2, n_at_once)(*primals)
     with jax.default_matmul_precision("highest"):
-        change = equilibrium_tangents(primals, tangents, end, found.settled)
-    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
-    return found, none._replace(**change._asdict())
+        tangent = equilibrium_tangents(primals, tangents, equilibrium, settled.settled)
+    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in settled))
+    return settled, none._replace(**tangent._asdict())
 
 
 settle.defjvp(_settle_jvp, symbolic_zeros=True)
 
 
-def settle_pressures(
-    kinematics: Kinematics, params: ArmParams, pressure_kpa: Array, n_at_once: int | None = None
-) -> Settled:
+def settle_pressures(params: ArmParams, pressure_kpa: Array, n_at_once: int | None = None) -> Settled:
     """Find the equilibrium at given pressures (n_chambers,), clipped to the arm's limits.
 
     The pressures become limits that leave no room, so this is `settle`, derivatives included.
     """
     pressure = jnp.clip(pressure_kpa, params.pressure_min_kpa, params.pressure_max_kpa)
     pinned = params._replace(pressure_min_kpa=pressure, pressure_max_kpa=pressure)
-    return settle(kinematics, pinned, params.spring_rest_m, n_at_once)
+    return settle(pinned, params.spring_rest_m, n_at_once)
 
 
 @functools.cache
@@ -138,36 +141,30 @@ def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
         if n_at_once and n_at_once < n:
-            found = xla.in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
+            solutions = xla.in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
         else:
-            found = _solve_arms_last(n_small, n, batched, *arguments)
-        return found, jax.tree.map(lambda _: True, found)
+            solutions = _solve_arms_last(n_small, n, batched, *arguments)
+        return solutions, jax.tree.map(lambda _: True, solutions)
 
     solve.def_vmap(many)
     return solve
 
 
 def _solve_arms_last(
-    n_small: int, n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array
+    n_small: int, n: int, batched: list[Any], params: ArmParams, reference_m: Array
 ) -> _Solution:
     """Return the solutions of n arms; `batched` is true for arrays that have the arms as first axis."""
 
-    def arms_last(x: Any, own: bool) -> Array:
-        return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
+    def arms_last(x: Any, is_batched: bool) -> Array:
+        return jnp.moveaxis(x, 0, -1) if is_batched else jnp.asarray(x)[..., None]
 
-    kinematics_own, params_own, reference_own = batched
-    if kinematics.arms_last:
-        kinematics = jax.tree.map(arms_last, kinematics, kinematics_own)
-    else:
-        axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
-        each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
-        kinematics = jax.tree_util.Partial(each, kinematics)  # pyright: ignore[reportAssignmentType]
-    reference_m = jnp.broadcast_to(arms_last(reference_m, reference_own), (reference_m.shape[-1], n))
-    found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
+    params_batched, reference_batched = batched
+    reference_m = jnp.broadcast_to(arms_last(reference_m, reference_batched), (reference_m.shape[-1], n))
+    solutions = _solve(n_small, jax.tree.map(arms_last, params, params_batched), reference_m)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solutions)
 
 
-def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Solution:
+def _solve(n_small: int, params: ArmParams, reference_m: Array) -> _Solution:
     """Return the equilibrium after `n_small` small steps and all that its derivative needs; arms are last."""
     # Start: the straight arm, its pressures as close to zero as the limits allow
     dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
@@ -187,50 +184,214 @@ def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m:
 
     # Iterate until no arm goes on, and once more: the last pass evaluates all arms where they have ended. A
     # second program for the end would take as long to compile as the loop
-    one_pass = functools.partial(newton_pass, jnp.asarray(n_small), kinematics, params, reference_m)
+    one_pass = functools.partial(_newton_pass, jnp.asarray(n_small), params, reference_m)
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         shapes = jax.eval_shape(one_pass, start)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        _, it, end = jax.lax.while_loop(
+        _, iterate, evaluation = jax.lax.while_loop(
             lambda loop: loop[0],
             lambda loop: (jnp.any(loop[1].goes_on(n_small, params)), *one_pass(loop[1])),
             (jnp.array(True), start, nothing),
         )
-        return _report(it, end, params, reference_m)
+        return _report(iterate, evaluation, params, reference_m)
 
 
-def _report(it: Iterate, end: End, params: ArmParams, reference_m: Array) -> _Solution:
+def _report(iterate: Iterate, evaluation: Evaluation, params: ArmParams, reference_m: Array) -> _Solution:
     """Return the last iterate as an equilibrium, with its errors and its result."""
-    pressure, frames, here, by_law = end
-    residual = jnp.max(jnp.abs(here.gradient), axis=0)
+    pressure, frames, potential, law_response = evaluation
+    residual = jnp.max(jnp.abs(potential.gradient), axis=0)
 
     # Errors of the law: at a limit, only an error counts that would take the chamber away from it
-    error = law_errors(reference_m - here.springs.length, pressure, params.allocation)
+    error = _law_errors(reference_m - potential.springs.length, pressure, params.allocation)
     at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
     outward = jnp.where(pressure >= params.pressure_max_kpa, error, -error)
     off = jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error))
     tracking = jnp.max(jnp.where(params.pinned, 0.0, off), axis=0)
 
     # Result, and all fields of the equilibrium; forces balance in an arm that is about to buckle, too
-    convex = it.convex if params.contact is None else it.convex & ~is_jammed(params.contact, frames)
+    convex = iterate.convex if params.contact is None else iterate.convex & ~is_jammed(params.contact, frames)
     good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M) & convex
-    numbers = here.gradient, error, params.law_stiffness
+    numbers = potential.gradient, error, params.law_stiffness
     finite = functools.reduce(jnp.logical_and, (jnp.all(jnp.isfinite(x), axis=0) for x in numbers))
     result = jnp.select(
         [~finite, good, ~convex],
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
         SettleResult.OUT_OF_ITERATIONS.value,
     )
-    found = Settled(
-        q=it.q,
+    settled = Settled(
+        q=iterate.q,
         pressure_kpa=pressure,
-        spring_m=here.springs.length,
+        spring_m=potential.springs.length,
         tip_position_m=frames.tip_position,
         tip_rotation=frames.tip_rotation,
         at_limit=at_limit,
         residual=residual,
         tracking_error_m=tracking,
         result=result.astype(jnp.int32),
-        iterations=it.iteration,
+        iterations=iterate.iteration,
     )
-    return found, Equilibrium(it.q, pressure, at_limit, frames, here, it.response, by_law)
+    return settled, Equilibrium(
+        iterate.q, pressure, at_limit, frames, potential, iterate.response, law_response
+    )
+
+
+class Iterate(NamedTuple):
+    """Numbers of all arms between two Newton steps."""
+
+    q: Array  # (nv, *arms)
+    pressure: Array  # (n_chambers, *arms) [kPa]
+    at_limit: Array  # (n_chambers, *arms) bool, active set of the last step
+    response: PressureResponse  # at the iterate before the last step
+    n_small: Array  # (*arms,) int, number of small steps in a row with an unchanged active set
+    held: Array  # (*arms,) bool, V has not been convex at some step: the law's gain takes part
+    stiffening: Array  # (*arms,) added joint stiffness as a share of the arm's own, where V is not convex
+    convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
+    iteration: Array  # (*arms,) int
+
+    def goes_on(self, n_small: Array | int, params: ArmParams) -> Array:
+        """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
+        most = MAX_ITERATIONS if params.contact is None else MAX_ITERATIONS_IN_CONTACT
+        return (self.n_small < n_small) & (self.iteration < most + n_small - 1)
+
+
+class Evaluation(NamedTuple):
+    """Forces and springs of all arms at an iterate."""
+
+    pressure: Array  # (n_chambers, *arms) [kPa]
+    frames: Frames
+    statics: Statics
+    law_response: Array  # (nv, n_springs, *arms) that of `Equilibrium`, in the last pass
+
+
+@jax.jit  # traced once for the loop, the shapes of its results, and both values of n_small
+def _newton_pass(
+    n_small: Array, params: ArmParams, reference_m: Array, iterate: Iterate
+) -> tuple[Iterate, Evaluation]:
+    """Return the next iterate, and forces and springs at the given one.
+
+    Arms that have ended keep their numbers. If all have, pressures are clipped to their limits, and the
+    joints' response to the law's gain is solved for in the place of a Newton step.
+    """
+    # Forces and springs at the iterate
+    goes_on, held = iterate.goes_on(n_small, params), iterate.held & ~iterate.at_limit
+    is_last = ~jnp.any(goes_on)
+    clipped = jnp.clip(iterate.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
+    pressure = jnp.where(is_last, clipped, iterate.pressure)
+    frames = chain_kinematics(params)(iterate.q)
+    potential = statics(frames, iterate.q, pressure, params.with_law_gain(held, reference_m))
+
+    # Joints by the forces and by each pressure: H^-1 (-grad V) and H^-1 B. Hanging arms are seldom held
+    hessian = potential.hessian.plus_diagonal(iterate.stiffening * params.joint_stiffness)
+    push = potential.push_per_kpa
+    columns = jnp.concatenate(
+        [-potential.gradient.reshape(*push.shape[:2], 1, *push.shape[3:]), push], axis=2
+    )
+    gains = gain_columns(potential, held, params)
+    padding = [(0, n - n_gains) for n_gains, n in zip(gains.shape, columns.shape, strict=True)]
+    columns = jnp.where(is_last, jnp.pad(gains, padding), columns)
+    solved = jax.lax.cond(is_last & ~jnp.any(held), jnp.zeros_like, hessian.solve, columns)
+
+    # Step of the arms that go on
+    clipped_iterate = iterate._replace(pressure=pressure)
+    stepped = _newton_step(clipped_iterate, frames, potential, solved, params, reference_m)
+    stepped = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), stepped, iterate)
+    law_response = solved[:, :, : len(reference_m)].reshape(len(iterate.q), *reference_m.shape)
+    return stepped, Evaluation(pressure, frames, potential, law_response)
+
+
+def _newton_step(
+    iterate: Iterate,
+    frames: Frames,
+    potential: Statics,
+    solved: Array,
+    params: ArmParams,
+    reference_m: Array,
+) -> Iterate:
+    """Return the iterate after a step in joint coordinates and pressures together: H dq = B dp - grad V.
+
+    Args:
+        iterate: start of the step.
+        frames: at the iterate.
+        potential: forces and springs at the iterate.
+        solved (n_sections, n, 1 + n_chambers, *arms): H^-1 [-grad V, B].
+        params: numbers of the arm.
+        reference_m (n_springs, *arms): spring lengths that the law tracks.
+    """
+    # Active set: chambers that leave the limits are held there
+    error = _law_errors(reference_m - potential.springs.length, iterate.pressure, params.allocation)
+    trial = iterate.pressure + ACTIVE_SET_GAIN_KPA_PER_M * error
+    limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
+    at_limit = (trial != limit) | params.pinned  # a pinned chamber even where its error is zero
+
+    # Pressures: each chamber closes its error or goes to its limit
+    newton_step, dq_dp = solved[:, :, 0], solved[:, :, 1:]
+    spring_response = products(potential.springs.jacobian, solved).reshape(
+        len(reference_m), -1, *error.shape[1:]
+    )
+    closed, closed_per_kpa = _closed_errors(spring_response[:, 0], spring_response[:, 1:], params.allocation)
+    rows = jnp.where(at_limit[:, None], identity(len(error), closed_per_kpa), closed_per_kpa)
+    residual = jax.lax.select(at_limit, limit - iterate.pressure, error - closed)
+    dp = eliminate(rows, residual[:, None])[:, 0]
+    dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(iterate.q.shape)
+
+    # Step length; where elimination gave NaN, the arm stays. If any chamber tracks, the law's gain takes part
+    # from now on; if it does already, or none tracks, the joints are stiffer for a step
+    largest = jnp.max(jnp.abs(dq), axis=0)
+    scale = jnp.minimum(1.0, MAX_STEP / largest)
+    if params.contact is not None:
+        scale = scale * step_share(params.contact, frames, chain_kinematics(params)(iterate.q + scale * dq))
+    finite = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
+    convex = finite & (iterate.stiffening == 0)
+    small = jnp.all(at_limit == iterate.at_limit, axis=0) & (largest < _small_step(params)) & convex
+    return Iterate(
+        q=jnp.where(finite, iterate.q + scale * dq, iterate.q),
+        pressure=jnp.where(finite, iterate.pressure + scale * dp, iterate.pressure),
+        at_limit=at_limit,
+        response=PressureResponse(dq_dp.reshape(iterate.response.dq_dp.shape), closed_per_kpa),
+        n_small=jnp.where(small, iterate.n_small + 1, 0),
+        held=iterate.held | ~finite,
+        stiffening=jnp.where(
+            finite | ~(iterate.held | jnp.all(at_limit, axis=0)), 0.0, 4.0 * iterate.stiffening + 4.0
+        ),
+        convex=convex,
+        iteration=iterate.iteration + 1,
+    )
+
+
+def _small_step(params: ArmParams) -> float:
+    """Return the largest entry of a small step; a wall's stiffness changes within less than a millimetre."""
+    return SMALL_STEP if params.contact is None else 0.1 * SMALL_STEP
+
+
+def _law_errors(spring_error_m: Array, pressure_kpa: Array, allocation: Allocation | None) -> Array:
+    """Return the error e of each chamber (n_chambers, *arms) [m].
+
+    Args:
+        spring_error_m (n_springs, *arms) [m]: references less lengths of the springs.
+        pressure_kpa (n_chambers, *arms) [kPa]: pressures.
+        allocation: matrices (..., *arms) of an arm with redundant chambers.
+    """
+    if allocation is None:
+        return spring_error_m
+    of_springs = product(allocation.chamber_error, spring_error_m[:, None])[:, 0]
+    return of_springs - YIELD_M_PER_KPA * product(allocation.redundant, pressure_kpa[:, None])[:, 0]
+
+
+def _closed_errors(
+    newton_spring_m: Array, spring_per_kpa: Array, allocation: Allocation | None
+) -> tuple[Array, Array]:
+    """Return by how much a Newton step, and each pressure, lessens the error of each chamber.
+
+    Args:
+        newton_spring_m (n_springs, *arms) [m]: lengthening of the springs by the step at constant pressures.
+        spring_per_kpa (n_springs, n_chambers, *arms) [m/kPa]: response of the springs to the pressures.
+        allocation: matrices (..., *arms) of an arm with redundant chambers.
+
+    Returns:
+        (n_chambers, *arms) [m] and (n_chambers, n_chambers, *arms) [m/kPa].
+    """
+    if allocation is None:
+        return newton_spring_m, spring_per_kpa
+    newton = product(allocation.chamber_error, newton_spring_m[:, None])[:, 0]
+    per_kpa = product(allocation.chamber_error, spring_per_kpa)
+    return newton, per_kpa + YIELD_M_PER_KPA * allocation.redundant

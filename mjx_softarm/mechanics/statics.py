@@ -36,6 +36,15 @@ class Tendons(NamedTuple):
     jacobian: Array  # (n_sections, t, n, *arms) by the n joints of a section
     link_hessian: Array  # (3 dofs, 3 dofs, t, n_links, *arms) by the joints of a link
 
+    def changed(self, dq: Array) -> Tendons:
+        """Return the change of lengths and Jacobians along joint velocities (nv, *arms); others are zero."""
+        n_sections, arms = len(self.length), dq.shape[1:]
+        along = dq.reshape(n_sections, 1, -1, *arms)
+        of_joint = jnp.moveaxis(dq.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)[:, None, None]
+        turned = jnp.sum(self.link_hessian * of_joint, axis=0)  # (3 dofs, t, n_links, *arms)
+        zeros = jnp.zeros_like(self.link_hessian)
+        return Tendons(jnp.sum(self.jacobian * along, axis=2), _by_section(turned, n_sections), zeros)
+
 
 class Lines(NamedTuple):
     """Lengths and Jacobians of the chambers, or of the springs."""
@@ -52,6 +61,12 @@ class Statics(NamedTuple):
     chambers: Lines
     springs: Lines
     area: Array  # (n_chambers, *arms) [N/kPa] effective areas
+
+    def changed(self, moved: tuple[Array, Array]) -> Array:
+        """Return the change of the gradient along joint velocities (nv, *arms) and rates of the pressures."""
+        dq, dp = moved
+        force = (self.area * dp).reshape(*self.chambers.jacobian.shape[:2], 1, *dp.shape[1:])
+        return self.hessian.times(dq) - jnp.sum(force * self.chambers.jacobian, axis=1).reshape(dq.shape)
 
     @property
     def push_per_kpa(self) -> Array:
@@ -108,7 +123,7 @@ def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, par
     weight, hessian = _gravity(frames, params)
     pull = jnp.sum(tension[:, :, None] * both.jacobian, axis=1)  # (n_sections, n, *arms)
     gradient = weight + params.joint_stiffness * q + pull.reshape(q.shape)
-    own = hessian.own + _bending(tension, both.link_hessian) + _stretching(slope, both.jacobian)
+    own = hessian.own + _bending(tension, both.link_hessian) + stretching(slope, both.jacobian)
     hessian = hessian._replace(own=own).plus_diagonal(params.joint_stiffness)
     return Statics(gradient, hessian, chambers, springs, area)
 
@@ -133,7 +148,7 @@ def _bending(tension: Array, link_hessian: Array) -> Array:
     return jax.vmap(block_diagonal)(blocks)
 
 
-def _stretching(slope: Array, jacobian: Array) -> Array:
+def stretching(slope: Array, jacobian: Array) -> Array:
     """Return sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n, *arms).
 
     Args:
@@ -177,13 +192,19 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     # Sums over the links of each section
     dofs = range(DOFS_PER_LINK)
     upper_half = {(i, j): second(i, j) for i in dofs for j in dofs[i:]}
-    own = jnp.stack(dlength_dq).reshape(DOFS_PER_LINK, t, n_sections, per_section, *arms)
     whole = length.reshape(t, n_sections, per_section, *arms).sum(2)
     return Tendons(
         length=jnp.swapaxes(whole, 0, 1),
-        jacobian=jnp.swapaxes(jnp.moveaxis(own, 0, 3), 0, 1).reshape(n_sections, t, -1, *arms),
+        jacobian=_by_section(jnp.stack(dlength_dq), n_sections),
         link_hessian=jnp.stack([jnp.stack([upper_half[min(i, j), max(i, j)] for j in dofs]) for i in dofs]),
     )
+
+
+def _by_section(of_joints: Array, n_sections: int) -> Array:
+    """Return numbers (3 dofs, t, n_links, *arms) of tendons and joints as (n_sections, t, n, *arms)."""
+    _, t, n_links, *arms = of_joints.shape
+    apart = of_joints.reshape(DOFS_PER_LINK, t, n_sections, n_links // n_sections, *arms)
+    return jnp.swapaxes(jnp.moveaxis(apart, 0, 3), 0, 1).reshape(n_sections, t, -1, *arms)
 
 
 def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> Array:
@@ -233,8 +254,4 @@ def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
             jnp.concatenate([own, more.reshape(*own.shape[:2], -1, *arms)], axis=2)
             for own, more in zip((above, below), factors, strict=True)
         )
-    earlier_first = products(above, jnp.swapaxes(below, 1, 2))
-    n = earlier_first.shape[1]
-    upper = jnp.tri(n, dtype=bool).T.reshape(n, n, *[1] * len(arms))
-    within = jnp.where(upper, earlier_first, jnp.swapaxes(earlier_first, 1, 2))
-    return gradient, ChainHessian(within, above, below)
+    return gradient, ChainHessian.of_factors(above, below)

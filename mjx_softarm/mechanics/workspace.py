@@ -14,7 +14,6 @@ from jax import Array
 
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.settle import Settled, arms_at_once, settle, settle_pressures
 from mjx_softarm.posture import hangs
@@ -54,7 +53,7 @@ def _solver(n_at_once: int | None):
     """Return the compiled equilibria of arms with the same parameters, pressures (n, n_chambers)."""
 
     def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
-        return settle_pressures(chain_kinematics(params), params, pressure_kpa, n_at_once)
+        return settle_pressures(params, pressure_kpa, n_at_once)
 
     return xla.jit(jax.vmap(solve, in_axes=(None, 0)))
 
@@ -69,14 +68,13 @@ def _loaded_solver(n_at_once: int | None, by_law: bool = False):
     def solve(
         params: ArmParams, pressure_kpa: Array, load_kg: Array, stiffness: Array, area: Array
     ) -> Settled:
-        own = params.stiffened(stiffness)._replace(area=params.area * area)
-        loaded = own._replace(tool_mass_kg=jnp.asarray(own.tool_mass_kg).at[PAYLOAD].set(load_kg))
-        kinematics = chain_kinematics(own)
+        arm = params.stiffened(stiffness)._replace(area=params.area * area)
+        loaded = arm._replace(tool_mass_kg=jnp.asarray(arm.tool_mass_kg).at[PAYLOAD].set(load_kg))
         if not by_law:
-            return settle_pressures(kinematics, loaded, pressure_kpa, n_at_once)
-        unloaded = settle_pressures(kinematics, own, pressure_kpa, n_at_once)
-        found = settle(kinematics, loaded, unloaded.spring_m, n_at_once)
-        return found._replace(result=jnp.maximum(found.result, unloaded.result))
+            return settle_pressures(loaded, pressure_kpa, n_at_once)
+        unloaded = settle_pressures(arm, pressure_kpa, n_at_once)
+        settled = settle(loaded, unloaded.spring_m, n_at_once)
+        return settled._replace(result=jnp.maximum(settled.result, unloaded.result))
 
     return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)))
 
@@ -109,8 +107,8 @@ def sample_workspace(spec: ArmSpec, n: int, seed: Seed) -> Pool:
         SpecError: the arm settles at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
-    found = settle_many(spec, random_pressures(spec, CANDIDATES_PER_POSE * n, rng))
-    return _pool(found, _chosen(spec, found, found.settled, n, rng, replace=False))
+    equilibria = settle_many(spec, random_pressures(spec, CANDIDATES_PER_POSE * n, rng))
+    return _pool(equilibria, _chosen(spec, equilibria, equilibria.settled, n, rng, replace=False))
 
 
 def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) -> LoadedPool:
@@ -133,9 +131,9 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     pressure_kpa = random_pressures(spec, shape[0], rng)
     factors = (rng.uniform(1.0 - spread, 1.0 + spread, shape) for _ in range(2))
     solver = functools.partial(_loaded_solver, by_law=not hangs(spec))
-    found = _in_batches(solver, spec, pressure_kpa, load_kg, *factors)
-    rows = _chosen(spec, found, found.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
-    pool = _pool(found, rows)
+    equilibria = _in_batches(solver, spec, pressure_kpa, load_kg, *factors)
+    rows = _chosen(spec, equilibria, equilibria.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
+    pool = _pool(equilibria, rows)
     return LoadedPool(load_kg[rows].astype(np.float32), pool.pressure_kpa, pool.spring_m, pool.pose)
 
 
@@ -158,19 +156,24 @@ def sample_evenly(spec: ArmSpec, n: int, seed: Seed) -> Pool:
     rng = np.random.default_rng(seed)
     half = CANDIDATES_PER_EVEN_POSE * n // 2
     extremes = rng.choice(pressure_levels(spec), (half, spec.n_chambers))
-    found = settle_many(spec, np.concatenate([random_pressures(spec, half, rng), extremes]))
+    equilibria = settle_many(spec, np.concatenate([random_pressures(spec, half, rng), extremes]))
     shortest, longest = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
-    in_range = (shortest <= found.spring_m) & (found.spring_m <= longest)
-    usable = found.settled & in_range.all(axis=-1)
-    return _pool(found, _chosen(spec, found, usable, n, rng, replace=True))
+    in_range = (shortest <= equilibria.spring_m) & (equilibria.spring_m <= longest)
+    usable = equilibria.settled & in_range.all(axis=-1)
+    return _pool(equilibria, _chosen(spec, equilibria, usable, n, rng, replace=True))
 
 
 def _chosen(
-    spec: ArmSpec, found: Settled, usable: np.ndarray | Array, n: int, rng: np.random.Generator, replace: bool
+    spec: ArmSpec,
+    equilibria: Settled,
+    usable: np.ndarray | Array,
+    n: int,
+    rng: np.random.Generator,
+    replace: bool,
 ) -> np.ndarray:
     """Draw rows (n,) of usable equilibria with weights that even out the number of tips per voxel."""
     # Number of candidates in the voxel of each one
-    tip_mm = np.where(usable[:, None], 1e3 * found.tip_position_m, 0.0)
+    tip_mm = np.where(usable[:, None], 1e3 * equilibria.tip_position_m, 0.0)
     _, voxel, count = np.unique(
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
     )
@@ -185,10 +188,10 @@ def _chosen(
     return rng.choice(len(weight), n, replace=replace, p=weight / weight.sum())
 
 
-def _pool(found: Settled, chosen: np.ndarray) -> Pool:
+def _pool(equilibria: Settled, chosen: np.ndarray) -> Pool:
     """Return the chosen rows of equilibria with their poses, as NumPy arrays."""
-    pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])
-    return Pool(found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
+    pose = pose_from_frame(equilibria.tip_position_m[chosen], equilibria.tip_rotation[chosen])
+    return Pool(equilibria.q[chosen], equilibria.pressure_kpa[chosen], equilibria.spring_m[chosen], pose)
 
 
 def extreme_poses(spec: ArmSpec) -> Settled:

@@ -1,4 +1,4 @@
-"""A trained policy as one file: its entries, its writer and its reader. NumPy only.
+"""A trained policy as one file: made of training's actor, written, read and checked. NumPy only.
 
 A sealed npz archive (`mjx_softarm._support.archive`) of an arm with n springs and c chambers; numbers are
 float64, networks and the workspace float32.
@@ -42,7 +42,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,19 +53,27 @@ from mjx_softarm.control import TOLERANCE_M, Gains, allocation
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import Observation, ObsScale, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.policy.networks import take_networks
-from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel
-from mjx_softarm.sensing.load import LoadEstimator
+from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
+from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
-from mjx_softarm.spec import ArmSpec, SpecError
-from mjx_softarm.spec_tables import Mounting
+from mjx_softarm.spec import ArmSpec, Mounting, SpecError
 
-SCHEMA_VERSION = 15
+SCHEMA_VERSION = 16
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
 SHIPPED_TWIN = SHIPPED.with_name("twin0.npz")  # calibrated to twin:0
+
+
+class ArmModel(NamedTuple):
+    """Networks and poses of an arm that its computer needs besides the specification."""
+
+    workspace: np.ndarray  # (m, 6) poses [mm, deg]
+    estimator: PoseEstimator
+    load_estimator: LoadEstimator
+    spring_model: SpringModel
+    s2r: S2R | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +116,62 @@ class Policy:
     def sensor(self) -> Sensor:
         """The arm's sensors, calibrated."""
         return self.actions.sensor
+
+
+def policy_from_actor(
+    actor_params: Mapping[str, Any],
+    spec: ArmSpec,
+    reward: RewardConfig,
+    model: ArmModel,
+    provenance: Mapping[str, Any],
+    **settings: Any,
+) -> Policy:
+    """Make the policy of an actor that was trained on an arm.
+
+    Args:
+        actor_params: as flax initialises the actor, `{"params": {"hidden_0": {"kernel", "bias"}, ...,
+            "head": {"kernel", "bias"}}}`. The head's first n outputs are the mean action, the others the
+            logarithms of its standard deviations.
+        spec: the arm; scales, limits, calibration and gains are its own, as in the environment.
+        reward: the environment's.
+        model: networks and workspace of the arm.
+        provenance: how the policy came about, in types that JSON has.
+        settings: fields of `Policy` that have defaults, from the run, its environment and its evaluation:
+            `activation`, `observation`, `tolerance_m`, `n_actions`, `action_s`.
+
+    Raises:
+        ValueError: the parameters do not belong to an actor for this arm. It is a SealedFileError if an
+            array has the wrong shape or is not finite.
+    """
+    policy = Policy(
+        layers=actor_layers(actor_params, spec),
+        obs_scale=ObsScale.from_spec(spec),
+        reward=reward,
+        actions=ActionMap.from_spec(spec),
+        gains=Gains.from_spec(spec),
+        rate_hz=spec.control.rate_hz,
+        **model._asdict(),
+        spec=spec,
+        provenance=provenance,
+        **settings,
+    )
+    # Check the policy as if it had been read.
+    return checked(policy)
+
+
+def actor_layers(actor_params: Mapping[str, Any], spec: ArmSpec) -> tuple[Layer, ...]:
+    """Return the actor's layers without its standard deviations; only this function knows flax's names.
+
+    Raises:
+        ValueError: the parameters, as for `policy_from_actor`, do not belong to an actor.
+    """
+    dense = actor_params.get("params", {})
+    names = [*(f"hidden_{k}" for k in range(len(dense) - 1)), "head"]
+    if set(dense) != set(names):
+        raise ValueError(f"actor parameters: got {sorted(dense)}, expected hidden_0, hidden_1, ... and head")
+    arrays = [[np.asarray(dense[name][part], np.float32) for part in ("kernel", "bias")] for name in names]
+    arrays[-1] = [array[..., : spec.n_springs] for array in arrays[-1]]
+    return tuple((weight, bias) for weight, bias in arrays)
 
 
 def action_layout(spec: ArmSpec) -> tuple[str, ...]:
@@ -184,6 +248,16 @@ def _take_reward(entries: Entries) -> RewardConfig:
     names = [item.name for item in dataclasses.fields(RewardConfig) if item.name != "axes"]
     numbers = {name: entries.take(f"reward.{name}", np.float64, ()) for name in names}
     return RewardConfig(**numbers, axes=tuple(entries.take("reward.axes", np.float64, (6,)).tolist()))
+
+
+def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadEstimator, SpringModel]:
+    """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries."""
+    n_sections, counts = spec.structure.n_sections, (spec.n_chambers, spec.n_springs)
+    return (
+        take_estimator(entries, "estimator", n_sections, spec.n_springs),
+        take_load_estimator(entries, "load_estimator", n_sections, *counts),
+        take_spring_model(entries, "spring_model", *counts),
+    )
 
 
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:

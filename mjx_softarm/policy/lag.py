@@ -1,4 +1,7 @@
-"""Lags of a moving arm: springs behind their references, the shape behind the springs. NumPy only."""
+"""Lags of an arm's springs behind their references, and the rule by which they are at rest.
+
+NumPy only; `still` takes the symbols of `mjx_softarm.export`, too.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,32 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import Gains
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.sensing.estimator import Frame, estimate, even_pose, expected_springs
-from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.sensing.estimator import expected_springs
+from mjx_softarm.spec import ArmSpec
 
 # Change of a pressure from which the springs' response is taken, in ranges of pressure. The slope of a
 # network differs by a third from place to place. Circle in 20 s, mean errors on a twin and two rods: 1.7, 1.9
 # and 3.4 mm with 0.05; 1.5, 1.4 and 1.8 mm with this; 1.5, 1.3 and 2.4 mm with one response for all places.
 _STEP = 0.4
 _LEAST_MODE = 1e-3  # response of a mode, in that of the largest, below which chambers do not move it
+
+# Rest. A twin is within 2 mm of its rest 4 s after an action, and creeps for some seconds more.
+WINDOW_S = 0.5  # least time over which springs are watched; by hand
+# Window of an arm with a slow law, in the largest lag of its springs. With 0.9, `sopra` takes 16 s for a goal
+# instead of 4 without both this and `STILL_M` in proportion, and underestimates its errors by 1.7 mm.
+WINDOW_SHARE = 0.5
+SETTLE_TIMEOUT_S = 15.0  # longest wait for rest; by hand, well above the 4 s of a twin
+# Largest difference of the two half windows' means, of springs 67 mm from the axis; in proportion for others,
+# whose change bends a section more. 10 times such a mean's noise.
+STILL_M = 2e-4
+# Largest error of a spring, in the mean of the window, that counts as on its reference; in proportion. With
+# 1 mm, at which chambers count as saturated, 0.3 mm were left on the way, and stops of policies of motion
+# were 2.5 mm off instead of 1.5.
+ARRIVED_M = 2.5e-4
+_RADIUS_M = 0.067  # distance of springs from the axis for which `STILL_M` and `ARRIVED_M` were chosen
 
 
 def spring_lag_s(policy: Policy, pressure_kpa: np.ndarray) -> np.ndarray:
@@ -50,34 +69,30 @@ def law_lag_s(
     return np.linalg.pinv(change * gains.ki_kpa_per_ms, rcond=_LEAST_MODE)
 
 
-class ShapeLag(NamedTuple):
-    """Memory of how unevenly the sections of a moving arm bend.
+class RestRule(NamedTuple):
+    """Numbers by which the springs of an arm are judged to be at rest."""
 
-    The pose at rest with some springs differs from that of sections that bend evenly. In motion this
-    difference lags behind the springs, see `calib.fit.motion.shape`. Both poses are the simulation's: the
-    sim-to-real network's correction does not lag.
-    """
+    window: int  # ticks over which springs are watched
+    still_m: float  # `STILL_M` of this arm
+    arrived_m: float  # `ARRIVED_M` of this arm
 
-    uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first lengths
 
-    def after(
-        self, policy: Policy, spring_m: np.ndarray, load_kg: float, dt_s: float
-    ) -> tuple[ShapeLag, np.ndarray]:
-        """Return the memory a time dt_s later, and the pose (6,) [mm, deg] at rest minus that in motion.
+def rest_rule(spec: ArmSpec, lag_s: np.ndarray) -> RestRule:
+    """Return the rule of rest of an arm whose springs have lags (n_springs, n_springs) [s]."""
+    slowest_s = float(np.abs(np.linalg.eigvals(lag_s)).max())
+    window_s = max(WINDOW_S, WINDOW_SHARE * slowest_s)
+    radius_m = float(np.mean(spec.per_section(spec.geometry.spring_radius_m)))
+    share = radius_m / _RADIUS_M
+    return RestRule(max(2, round(window_s * spec.control.rate_hz)), share * STILL_M, share * ARRIVED_M)
 
-        Args:
-            policy: the arm.
-            spring_m (n_springs,) [m]: spring lengths then.
-            load_kg: payload.
-            dt_s: time since the last lengths.
-        """
-        # Difference at rest
-        own = policy.estimator
-        base, pose = Frame(own.base_position_m, own.base_rotation), estimate(own, spring_m, load_kg)
-        uneven = pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
-        # The arm begins at rest
-        if self.uneven is None:
-            return ShapeLag(uneven), np.zeros(6)
-        lag_s = policy.spec.shape_lag_s
-        now = self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven)
-        return ShapeLag(now), pose_error(uneven, now)
+
+def middle_kpa(gains: Gains, n_chambers: int) -> np.ndarray:
+    """Return the pressures (n_chambers,) [kPa] in the middle of their range."""
+    return np.broadcast_to(0.5 * (gains.pressure_min_kpa + gains.pressure_max_kpa), n_chambers)
+
+
+def still(spring_m: Array, still_m: float = STILL_M) -> Array:
+    """Return whether springs came to rest over a window (ticks, n) [m]: its halves have the same mean."""
+    xp, half = array_namespace(spring_m), len(spring_m) // 2
+    moved_m = xp.mean(spring_m[-half:], axis=0) - xp.mean(spring_m[:half], axis=0)  # (n,)
+    return xp.all(xp.abs(moved_m) < still_m)

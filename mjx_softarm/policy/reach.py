@@ -1,8 +1,9 @@
-"""Reachable poses nearest to goals, by the policy file's models of the arm; lengths of an arm at its limits.
+"""Reachability of goals: by the nearest stored pose, within a tick; by a search with the policy's models.
 
-The search runs over the pressures between their limits: pressures give spring lengths, spring lengths give
-the tip pose. It takes Levenberg-Marquardt steps from several starts at once, and holds a pressure at its
-limit if a step would leave the range. Poses that the arm reaches in simulation are found to about 0.4 mm.
+Stored poses lie some 15 mm apart. The search is sharper, and takes longer than a tick. It runs over the
+pressures between their limits: pressures give spring lengths, spring lengths give the tip pose. It takes
+Levenberg-Marquardt steps from several starts at once, and holds a pressure at its limit if a step would leave
+the range. Poses that the arm reaches in simulation are reached to about 0.4 mm.
 `begin`, `improve` and `nearest_of` take NumPy arrays and the symbols of `mjx_softarm.export`.
 
 Source: Kanzow, Yamashita, Fukushima, "Levenberg-Marquardt methods with strong local convergence properties
@@ -11,21 +12,93 @@ for solving nonlinear equations with convex constraints", J. Comput. Appl. Math.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace, solve
 from mjx_softarm.control import at_chambers, planes
-from mjx_softarm.mdp.rewards import weighted_angles, weighted_error, weighted_position
+from mjx_softarm.mdp.rewards import RewardConfig, weighted_angles, weighted_error, weighted_position
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
-from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
+from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, share_of_turn
 from mjx_softarm.sensing.s2r import corrected
 
 N_STARTS, N_STEPS = 4, 20
 _DIFFERENCE = 1e-3  # step of the finite differences, as a share of the range of pressures
 _EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after a step that did not
 _LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e-3, 1e3
+_CHUNK = 256  # number of poses whose distances to all others are computed at once
+_INSIDE = 0.99  # distance over the limit of a goal that was brought back into the workspace
 _STAYING = 1e-4  # weight of a chamber that does not follow; chambers that follow have 1
+
+
+class Reachable(NamedTuple):
+    """Reachable poses, in the measure of the reward: millimetres and degrees by their weights."""
+
+    pose: np.ndarray  # (m, 6) [mm, deg]
+    position: np.ndarray  # (m, 3) weighted; (m, 9) with the angles, where their weights differ
+    rotation: np.ndarray  # (m, 9)
+    reward: RewardConfig
+    limit: float  # largest distance of a pose to its nearest neighbour
+
+    @classmethod
+    def from_poses(cls, pose: np.ndarray, reward: RewardConfig) -> Reachable:
+        """Compare poses (m, 6) [mm, deg] spread over the workspace, two thousand or more."""
+        pose = np.asarray(pose, np.float64)
+        position, flat = _weighted(reward, pose)
+        poses = cls(pose, position, flat, reward, 0.0)
+        nearest = []
+        for start in range(0, len(pose), _CHUNK):
+            rows = np.arange(start, min(start + _CHUNK, len(pose)))
+            distance = _distances(poses, poses.position[rows], flat[rows])  # (rows, m)
+            distance[np.arange(len(rows)), rows] = np.inf
+            nearest.append(distance.min(axis=1))
+        return poses._replace(limit=float(np.concatenate(nearest).max()))
+
+
+def nearest(reachable: Reachable, goal: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the reachable pose (6,) [mm, deg] nearest to a goal (6,), and its distance over the limit."""
+    distance = distances(reachable, np.asarray(goal, np.float64))
+    index = int(np.argmin(distance))
+    return reachable.pose[index], float(distance[index])
+
+
+def distances(reachable: Reachable, goal: Array) -> Array:
+    """Return the distances (m,) of a goal (6,) [mm, deg] to the reachable poses, over the limit."""
+    return _distances(reachable, *_weighted(reachable.reward, goal[None]))[0] / reachable.limit
+
+
+def clamped(reachable: Reachable, goal: np.ndarray) -> np.ndarray:
+    """Return a goal (6,) [mm, deg] within the limit: itself, or on the way to it from the nearest pose."""
+    goal = np.asarray(goal, np.float64)
+    pose, away = nearest(reachable, goal)
+    if away <= 1.0:
+        return goal
+    share = _INSIDE / away
+    (from_m, from_rotation), (to_m, to_rotation) = frame_from_pose(pose), frame_from_pose(goal)
+    rotation = share_of_turn(to_rotation @ from_rotation.T, np.array(share)) @ from_rotation
+    return pose_from_frame(from_m + share * (to_m - from_m), rotation)
+
+
+def _weighted(reward: RewardConfig, pose: Array) -> tuple[Array, Array]:
+    """Return `Reachable.position` and `Reachable.rotation` of poses (k, 6) [mm, deg]."""
+    position_m, rotation = frame_from_pose(pose)
+    position = weighted_position(position_m, reward)
+    if reward.turn_weight_per_deg is None:
+        position = array_namespace(pose).concat([position, weighted_angles(rotation, reward)], axis=-1)
+    return position, rotation.reshape(-1, 9)
+
+
+def _distances(reachable: Reachable, position: Array, rotation: Array) -> Array:
+    """Return distances (k, m) of `_weighted` positions and rotations to the poses, turns by their angle."""
+    xp = array_namespace(position, rotation)
+    squares = xp.sum(position**2, axis=1)[:, None] + np.sum(reachable.position**2, axis=1)
+    away = xp.maximum(squares - 2.0 * position @ reachable.position.T, 0.0)
+    if not reachable.reward.turn_weight_per_deg:
+        return xp.sqrt(away)
+    cos = xp.clip(0.5 * (rotation @ reachable.rotation.T - 1.0), -1.0, 1.0)
+    return xp.sqrt(away + (reachable.reward.turn_weight_per_deg * xp.rad2deg(xp.acos(cos))) ** 2)
 
 
 def nearest_poses(policy: Policy, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,8 +122,8 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     xp, n = array_namespace(goal, search), policy.spec.n_chambers
     share, damping = search[:, :n], search[:, n]
     target = _target(policy, goal, len(share))  # (rows, f)
-    error = _at(policy, share) - target
-    beside = _at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, f)
+    error = _features_at(policy, share) - target
+    beside = _features_at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, f)
     slope = (beside - error[:, None]) / _DIFFERENCE
     gradient = xp.sum(slope * error[:, None], axis=-1)  # (rows, n)
     # Pressures at a limit that would leave their range do not move.
@@ -59,7 +132,7 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     # Take the step where it helps; else only raise the damping.
     curvature = slope @ xp.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
     tried = xp.clip(share - solve(curvature, gradient), 0.0, 1.0)
-    helped = xp.sum((_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
+    helped = xp.sum((_features_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
     damping = xp.clip(damping * xp.where(helped, _EASE, _STIFFEN), _LEAST_DAMPING, _MOST_DAMPING)
     return xp.concat([xp.where(helped[:, None], tried, share), damping[:, None]], axis=1)
 
@@ -67,7 +140,7 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
 def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array]:
     """Return a search's nearest poses (k, 6) [mm, deg] to goals (k, 6), and their weighted errors (k,)."""
     xp, share = array_namespace(goal, search), search[:, : policy.spec.n_chambers]
-    error = _at(policy, share) - _target(policy, goal, len(share))
+    error = _features_at(policy, share) - _target(policy, goal, len(share))
     square = xp.sum(error**2, axis=-1).reshape(-1, N_STARTS)
     pose = pose_from_frame(*_tip(policy, share)).reshape(-1, N_STARTS, 6)
     best, least = pose[:, 0], square[:, 0]
@@ -76,19 +149,6 @@ def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array
         best = xp.where(better[:, None], pose[:, start], best)
         least = xp.where(better, square[:, start], least)
     return best, weighted_error(best, goal, policy.reward)
-
-
-def best_of(policy: Policy, goal: np.ndarray, search: np.ndarray) -> np.ndarray:
-    """Return the best row (1, n + 1) of a search for one goal (1, 6) [mm, deg], to go on from."""
-    share = search[:, : policy.spec.n_chambers]
-    off = np.sum((_at(policy, share) - _target(policy, goal, len(share))) ** 2, axis=-1)
-    # Steps that no longer helped have raised the damping.
-    return np.append(share[np.argmin(off)], _FIRST_DAMPING)[None]
-
-
-def springs_of(policy: Policy, search: np.ndarray) -> np.ndarray:
-    """Return the spring lengths (rows, n_springs) [m] of the rows of a search."""
-    return np.asarray(_springs(policy, search[:, : policy.spec.n_chambers]), float)
 
 
 def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
@@ -106,7 +166,7 @@ def _springs(policy: Policy, share: Array) -> Array:
     return expected_springs(policy.spring_model, low + (high - low) * share)
 
 
-def _at(policy: Policy, share: Array) -> Array:
+def _features_at(policy: Policy, share: Array) -> Array:
     """Return the `_features` (..., f) of the tip at shares (..., n) of the range of pressures."""
     return _features(policy, *_tip(policy, share))
 

@@ -37,6 +37,7 @@ N_AVERAGED = 8  # number of estimates in the moving average
 JUMP = 0.25
 N_JUMPS = 2  # number of consecutive outliers that restart the average
 QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
+KNOWN = 0.3  # greatest half-width, in largest payloads, of a 95 % interval that is believed; by hand
 # Payloads in the network's data, as shares of the largest one: an interval outside holds no payload.
 LOWEST, HIGHEST = -0.5, 1.5
 # Standard deviations of the factors by which the simulated change is off. The first is of all chambers

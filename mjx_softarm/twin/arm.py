@@ -4,6 +4,16 @@ Its model is finer than training's: inexact parts, chambers with hysteresis, joi
 air and noisy sensors. Training and calibration never import it. Its parameters are drawn from one integer
 seed and stay private.
 
+Hysteresis and friction are stop operators: springs, each in series with a slider. A stop follows the
+displacement x elastically until its force reaches its limit, then slides:
+
+    f'  = clip(f + k (x' - x), -limit, limit)
+
+The sum of several is the Prandtl-Ishlinskii model. It is passive: a slider only dissipates energy, and a
+spring returns the energy that it stored. A single stop is Coulomb friction with an elastic start.
+
+Source: Brokate, Sprekels, "Hysteresis and Phase Transitions", Springer 1996, chapter 2.
+
 Clock: simulated time passes only in `write_pressures`, by one control period of the specification. So a loop
 that reads, computes and writes runs at the control rate on any machine.
 """
@@ -22,7 +32,6 @@ from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.instruments import (
     AS_BUILT,
     EVALUATION_SESSION,
@@ -44,6 +53,29 @@ FRICTION_LIMIT = (0.3, 0.01, 0.01)  # [N, N m, N m]
 FRICTION_STROKE = (2e-4, 5e-3, 5e-3)  # [m, rad, rad]
 
 REST_S = 4.0  # time for which the arm rests at atmospheric pressure before its clock starts
+
+
+class StopOperators:
+    """Rate-independent hysteresis: m stop operators in parallel on each of n displacements."""
+
+    def __init__(self, stiffness: np.ndarray, limit: np.ndarray, x: np.ndarray):
+        """Start without force, at displacements x (n,).
+
+        Args:
+            stiffness (n, m): stiffness of each spring, force per displacement.
+            limit (n, m): largest force of each slider.
+            x (n,): displacements.
+        """
+        self._stiffness, self._low, self._high = stiffness, -limit, limit
+        self._x = np.array(x, float)
+        self._force = np.zeros(np.shape(limit))
+
+    def move(self, x: np.ndarray) -> np.ndarray:
+        """Move to x (n,); return the resisting force (n,), positive where the displacement has grown."""
+        trial = self._force + self._stiffness * (x - self._x)[:, None]
+        self._force = np.minimum(np.maximum(trial, self._low), self._high)
+        self._x = np.array(x, float)
+        return self._force.sum(axis=1)
 
 
 class Twin(InstrumentedArm):

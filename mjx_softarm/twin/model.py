@@ -182,5 +182,5 @@ def _mount(mjspec: mujoco.MjSpec, kind: str, hole_m: np.ndarray, parts: Parts) -
         cos, sin = np.cos(parts.twist_rad[section]), np.sin(parts.twist_rad[section])
         for k in range(per_section + 1):
             site = mjspec.site(f"{kind}{index}_plate{section * per_section + k}")
-            at = [cos * x - sin * y, sin * x + cos * y] if k == 0 else [x, y]
-            site.pos = [*at, site.pos[2]]
+            place = [cos * x - sin * y, sin * x + cos * y] if k == 0 else [x, y]
+            site.pos = [*place, site.pos[2]]

@@ -103,18 +103,18 @@ def _walls(pipe: CrossPipe):
 
 def _containers(pipe: CrossPipe):
     """Yield (name, corners (k, 3) [m], colour, group) of the floors, and of the left and right outer ends."""
-    at = pipe.containers()
+    places = pipe.containers()
     # Half the width of a side's floor. In a narrow pipe the wall itself is the floor.
     width = np.sqrt(max(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2, 0.0))
     for side in ("left", "right") if width > LEAST_WIDTH_M else ():
-        outwards, floor_z = np.sign(at[side][0]), at[side][2] - FLOOR_BELOW_M
+        outwards, floor_z = np.sign(places[side][0]), places[side][2] - FLOOR_BELOW_M
         for part, x, z in (
             ("floor", (pipe.radius_m + LEDGE_M, pipe.branch_m), (floor_z - SHEET_M, floor_z)),
             ("end", (pipe.branch_m, pipe.branch_m + SHEET_M), (floor_z - SHEET_M, floor_z + END_HEIGHT_M)),
         ):
             corners = [[outwards * a, b, c] for a, b, c in itertools.product(x, (-width, width), z)]
             yield f"{CONTAINER}_{side}_{part}", np.array(corners), _CONTAINER_COLOURS[side], 0
-    rim = rim_points(pipe.radius_m, N_PLANKS) + at["bottom"] - [0.0, 0.0, FLOOR_BELOW_M]
+    rim = rim_points(pipe.radius_m, N_PLANKS) + places["bottom"] - [0.0, 0.0, FLOOR_BELOW_M]
     plate = np.concatenate([rim, rim - [0.0, 0.0, SHEET_M]])
     yield f"{CONTAINER}_bottom_floor", plate, _CONTAINER_COLOURS["bottom"], 0
 

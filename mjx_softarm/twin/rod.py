@@ -226,12 +226,12 @@ class Rod:
         lever = np.cross(up, turn).reshape(n * N_STRAINS, 3)
         matrix = (lever @ fall.reshape(-1, 3).T).reshape(n, N_STRAINS, n, N_STRAINS)
         matrix *= np.triu(np.ones((n, n)))[:, None, :, None]
-        # Make the matrix symmetric, and add the elements' own stiffness.
-        own = np.arange(n)
-        matrix[own, :, own] *= 0.5
+        # Make the matrix symmetric, and add the elements' diagonal stiffness.
+        diagonal = np.arange(n)
+        matrix[diagonal, :, diagonal] *= 0.5
         matrix = matrix.reshape(n * N_STRAINS, -1)
         matrix = (matrix + matrix.T).reshape(n, N_STRAINS, n, N_STRAINS)
-        matrix[own, :, own] += local
+        matrix[diagonal, :, diagonal] += local
         return gradient + fall @ up, matrix.reshape(n * N_STRAINS, -1)
 
     def _weights(self) -> tuple[np.ndarray, np.ndarray]:

@@ -245,7 +245,7 @@ def _holes(
 
 
 def draw_regulator(seed: int, spec: ArmSpec, deadband: float = 1.0) -> Regulator:
-    """Draw the regulators of a rod, with random numbers of their own.
+    """Draw the regulators of a rod, with random numbers of their mean.
 
     Args:
         seed: seed of the rod.
@@ -257,8 +257,8 @@ def draw_regulator(seed: int, spec: ArmSpec, deadband: float = 1.0) -> Regulator
 
     def each(bounds: tuple[float, float]) -> np.ndarray:
         """Draw a number of the rod, and a number near it for each chamber (n,)."""
-        own = rng.uniform(*bounds)
-        return own * rng.uniform(1.0 - CHAMBER_SPREAD, 1.0 + CHAMBER_SPREAD, spec.n_chambers)
+        mean = rng.uniform(*bounds)
+        return mean * rng.uniform(1.0 - CHAMBER_SPREAD, 1.0 + CHAMBER_SPREAD, spec.n_chambers)
 
     return Regulator(
         lag_s=each(LAG_S),

@@ -17,10 +17,9 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.__main__ import tell
+from mjx_softarm.deploy.__main__ import Arm, ArmOptions, finish, tell
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drivers.driven import Arm, Driven, finish
-from mjx_softarm.deploy.drivers.same_arm import check_arm
+from mjx_softarm.deploy.drivers.names import check_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import TABLES
@@ -45,7 +44,7 @@ class Address:
 
 
 @dataclass(frozen=True)
-class Steered(Driven):
+class Steered(ArmOptions):
     """Arm that the page steers, and its policy."""
 
     arm: Arm = "twin:0"

@@ -18,14 +18,14 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import Paced
-from mjx_softarm.deploy.ending import FAULT, LoopRun
-from mjx_softarm.deploy.goals import Orders
-from mjx_softarm.deploy.loop import LoopState, Tick
-from mjx_softarm.deploy.session import steer
+from mjx_softarm.deploy.ending import FAULT
+from mjx_softarm.deploy.goals import Order
+from mjx_softarm.deploy.loop import LoopState
+from mjx_softarm.deploy.session import LoopRun, steer
 from mjx_softarm.deploy.strategy import AtRest, Timed
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.policy.reachable import clamped
+from mjx_softarm.policy.reach import clamped
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.look import look_at
@@ -66,8 +66,8 @@ class PagePilot:
         self._tell(text)
         self._said.append(text)
 
-    def orders(self) -> Orders:
-        """Return the page's orders since the last tick."""
+    def orders(self) -> Order:
+        """Return the page's order since the last tick; of several, the safest one counts."""
         # Take the page's messages.
         asked = self._first | self._end.take()
         self._first = {}
@@ -81,23 +81,23 @@ class PagePilot:
         # Stop and Vent come before all else, and disarm.
         if "vent" in asked or "hold" in asked:
             self._armed, self._goal, self._loads = False, np.full(6, np.nan), []
-            return Orders(vent="vent" in asked, hold=True)
+            return "vent" if "vent" in asked else "hold"
         # Goals count once a user has asked for motion.
         self._armed |= not asked.keys().isdisjoint(("circle", "follow", "place"))
         if not asked.keys().isdisjoint(("circle", "follow", "goal")):
             self._loads = []
         if "circle" in asked:
-            return Orders(goals=self._circle)
+            return self._circle
         if "place" in asked:
             self._loads = _ROUNDS * [None, _OBJECT_KG, None, None, 0.0, None]
-            return Orders(goals=self._place)
+            return self._place
         if "goal" in asked and self._armed:
-            return Orders(goals=[self._clamped(asked["goal"])])
-        return Orders()
+            return [self._clamped(asked["goal"])]
+        return None
 
-    def look(self, state: LoopState, tick: Tick, row: dict[str, Any]) -> None:
+    def look(self, state: LoopState, row: dict[str, Any]) -> None:
         """Show a tick on the page; attach or release the object at arrivals."""
-        if tick.arrived and self._loads and (load_kg := self._loads.pop(0)) is not None:
+        if state.arrived and self._loads and (load_kg := self._loads.pop(0)) is not None:
             self._carry(load_kg)
         if self._takes:
             self.tell(self.demonstrations.take(state, row))
@@ -175,7 +175,7 @@ def live(
         ready(_address(end))
         pilot = PagePilot(end, arm, controller, tell)
         arm = Paced(arm) if hasattr(arm, "time_s") else arm
-        run = steer(arm, controller, pilot, pilot.tell, save)
+        run = steer(arm, controller, pilot.orders, pilot.look, pilot.tell, save)
         if save_demonstrations and len(pilot.demonstrations):
             save_demonstrations(pilot.demonstrations.log())
         end.put(ended=run.ending.cause, vented=run.ending.vented)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm.control import saturated
-from mjx_softarm.deploy.belief import still
 from mjx_softarm.deploy.link import Recorder
 from mjx_softarm.deploy.loop import LoopState
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.lag import still
 from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion, quaternion_from_pose
 
 APART = np.repeat([1.0, 1.0], 3)  # [mm, deg] smallest difference from the last taken pose, in one number

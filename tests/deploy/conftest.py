@@ -2,7 +2,7 @@
 
 import pytest
 
-from mjx_softarm.policy.reachable import Reachable
+from mjx_softarm.policy.reach import Reachable
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,10 +9,10 @@ import pytest
 
 from calib.changes import MIN_POSES
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.accuracy.budget import Budget, budget
-from mjx_softarm.deploy.accuracy.measure import figures, measure, write_accuracy
 from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.budget import Budget, budget
 from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.measure import figures, measure, write_accuracy
 from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import tip_pose
@@ -135,7 +135,7 @@ def test_errors_as_at_the_calibration_are_the_models():
     found = split(Planted(off_mm=np.array([0.3, 0.0, 0.4])))
     assert not found.shift_mm.any() and found.parts_mm["rest"] == pytest.approx(0.0, abs=0.03)
     assert found.parts_mm["S2R"] / found.parts_mm["estimator"] == pytest.approx(16 / 9)
-    assert found.largest == "S2R" and "record the poses of `calib plan`" in found.lines()[1]
+    assert found.largest == "S2R" and "record more random poses" in found.lines()[1]
 
 
 def test_errors_with_a_payload_are_no_shift_of_the_zeros():
@@ -177,7 +177,7 @@ def test_measure_tells_the_parts_hangs_the_payload_and_logs_it(tmp_path, monkeyp
     monkeypatch.setattr(Planted, "attach", lambda _, kg: hung_kg.append(kg), raising=False)
     save_policy(tmp_path / "policy.npz", POLICY)
     monkeypatch.setattr("mjx_softarm.deploy.__main__._controller", lambda *at: CONTROLLER)
-    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: Planted(policy=POLICY))
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: Planted(policy=POLICY))
     monkeypatch.setattr("mjx_softarm.deploy.__main__.read_goals", lambda *at: GOALS)
     out = tmp_path / "out"
     assert main(["measure", "--arm", "its:Arm", "--out", str(out), "--payload", "250"]) == 0

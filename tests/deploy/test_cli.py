@@ -14,7 +14,6 @@ from calib.read.logs import read_log
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.drivers.names import Paced, open_arm, twin_spec
-from mjx_softarm.logs.pressure_plan import write_plan
 from mjx_softarm.policy.file import SHIPPED, load_policy, save_policy
 from mjx_softarm.spec import ArmSpec
 from tests.linear_arm import DT_S, FAR, POLICY, REST_M, SENSOR, LinearArm, N
@@ -205,17 +204,6 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
     assert (folder / "a.csv").read_text().count("\n") == 1 + 25
 
 
-def test_a_plan_of_pressures_is_recorded(tmp_path, capsys):
-    plan, out = tmp_path / "next.csv", tmp_path / "log.npz"
-    planned_kpa = np.array([[-5.0, 3, -10, -5, 2, 4, 2, -9, -4], [-6.0, 2, -8, -4, 3, 3, 1, -8, -5]])
-    write_plan(plan, planned_kpa)
-    assert main(["record", "--arm", "twin:rod:101", "--plan", str(plan), "--out", str(out)]) == 0
-    found = read_log(out)[0]
-    np.testing.assert_allclose(found.pressure_kpa, planned_kpa, atol=0.45)  # the rod's largest deadband
-    said = capsys.readouterr().out
-    assert "arm: paper, 9 chambers, -40 to 20 kPa, by default; --spec names another arm\n" in said
-
-
 @pytest.mark.parametrize(
     ("name", "spec"),
     [
@@ -242,7 +230,7 @@ def test_record_tells_its_arm_and_a_twin_of_another(words, told, tmp_path, monke
         tmp_path / "wide.toml"
     )
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: LinearArm())
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: LinearArm())
     main(["record", "--arm", *words, "--out", "a.csv", "--poses", "1"])
     assert told in capsys.readouterr().out
 
@@ -269,7 +257,7 @@ def test_another_arm_than_the_policy_s_gets_no_pressure(n, reading, message, tmp
             raise AssertionError("pressures were written")
 
     save_policy(tmp_path / "policy.npz", POLICY)
-    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: Other())
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: Other())
     goal = "--goal=" + ",".join(map(str, POLICY.workspace[0]))
     assert main(["run", str(tmp_path / "policy.npz"), "--arm", "its:Arm", goal]) == 2
     assert re.search(f"error: --arm its:Arm: {message}", capsys.readouterr().err)

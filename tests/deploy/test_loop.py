@@ -7,14 +7,16 @@ import pytest
 
 from calib.read.logs import read_log
 from mjx_softarm.control import Gains
-from mjx_softarm.deploy import link
+from mjx_softarm.deploy import goals as sources
+from mjx_softarm.deploy import link, moving, strategy
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.deploy.controller import LOOP, Controller
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import MISSED, Ending
+from mjx_softarm.deploy.goals import on_the_way
 from mjx_softarm.deploy.loop import start, step, with_goal
-from mjx_softarm.deploy.moving.way import on_the_way
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
+from mjx_softarm.deploy.strategy import N_CORRECTIONS
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.observation import layouts
@@ -78,7 +80,7 @@ def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():
     plan, asked = asking(exact_plan, arm)
     run = go(arm, goals=GOALS[:1], controller=Controller.of(OF_MOTION, plan))
     assert len(run.arrivals) == 1 and not run.events
-    assert [tick for *_, tick in asked] == [0, 15, 30] + (1 + LOOP.n_corrections) * [45]
+    assert [tick for *_, tick in asked] == [0, 15, 30] + (1 + N_CORRECTIONS) * [45]
     first, second = asked[0][3], asked[1][3]
     np.testing.assert_array_equal(first[9:21], 0.0)  # no rate of the springs, nor of the tip
     middle = 0.5 * (SPEC.springs.length_min_m + SPEC.springs.length_max_m)
@@ -123,12 +125,18 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     assert np.abs(early).max() > 1e-3
 
 
+@pytest.fixture
+def uncorrected(monkeypatch):
+    """Goals without corrections: the linear arm's poses are not those of its references."""
+    for module in (strategy, moving):
+        monkeypatch.setattr(module, "SHIFT_LIMIT", np.zeros(6))
+
+
 @pytest.mark.parametrize("slower", [1.0, 4.0])
-def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower):
+def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower, uncorrected):
     spec = SPEC.replace(control={"ki_kpa_per_ms": SPEC.control.ki_kpa_per_ms / slower})
     policy = dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec))
-    config = dataclasses.replace(LOOP, max_shift=(0.0, 0.0))  # this arm's poses are not its references'
-    run = trace(LinearArm(noise_m=0.0), Controller.of(policy, between, config), GOALS[:2], pace_s=10.0)
+    run = trace(LinearArm(noise_m=0.0), Controller.of(policy, between), GOALS[:2], pace_s=10.0)
     rows = np.arange(run.ways[0].start, run.ways[0].stop)[300:480]
     due_m = [between(None, goal, None, None) for goal in run.log.goal[rows]]
     behind_m = np.abs(read_m(run.log)[rows] - due_m)
@@ -142,27 +150,28 @@ def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():
     )
     slow = Controller.of(dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec)))
     assert slow.window > 1.5 * CONTROLLER.window
-    assert slow.config.still_m == pytest.approx(0.5 * CONTROLLER.config.still_m) == 1e-4
-    assert slow.config.arrived_m == pytest.approx(0.5 * CONTROLLER.config.arrived_m) == 1.25e-4
+    assert slow.rest.still_m == pytest.approx(0.5 * CONTROLLER.rest.still_m) == 1e-4
+    assert slow.rest.arrived_m == pytest.approx(0.5 * CONTROLLER.rest.arrived_m) == 1.25e-4
 
 
-def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag():
-    config = dataclasses.replace(LOOP, way_share_per_s=0.0)  # this arm's poses are not its references'
+def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag(uncorrected, monkeypatch):
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     plan, asked = asking(between, arm)
-    controller = Controller.of(OF_MOTION, plan, config)
+    controller = Controller.of(OF_MOTION, plan)
+    lead_s, start_s = moving.lead_of(controller)
+    assert 0.2 < lead_s == start_s < 2.0
+    monkeypatch.setattr(sources, "lead_of", lambda _: (lead_s, start_s))  # found twice it takes long
     run = trace(arm, controller, goals, pace_s=10.0)
-    assert 0.2 < controller.lead_s < 2.0
     begun = run.ways[0].start
     waited_s = (begun - run.arrivals[0].row) * DT_S  # so the goal ahead begins at the stop
-    assert waited_s == pytest.approx(controller.lead_s, abs=2.5 * DT_S)
+    assert waited_s == pytest.approx(lead_s, abs=2.5 * DT_S)
     goal, tick = next((goal, tick) for _, goal, *_, tick in asked if tick > begun + 200)
     on_way = [(tick, sensed) for *_, sensed, tick in asked if begun < tick < begun + 200]
     assert np.all(np.diff([tick for tick, _ in on_way]) == 1)  # an action in each tick
     for tick_of, sensed in on_way[::20]:  # the last action is that of 0.3 s ago
         then_m = run.log.reference_m[tick_of - 15]
         np.testing.assert_allclose(POLICY.actions.lengths(sensed[-9:]), then_m, atol=1e-5)
-    ahead = on_the_way(goals, ((tick - begun) * DT_S + controller.lead_s) / 10.0)
+    ahead = on_the_way(goals, ((tick - begun) * DT_S + lead_s) / 10.0)
     np.testing.assert_allclose(goal, ahead, atol=0.003 * np.max(np.abs(goals[1] - goals[0])))  # a tick apart
 
 
@@ -189,7 +198,7 @@ def test_policy_itself_plans_by_default():
 
 def test_state_is_not_changed_in_place():
     state, _ = with_goal(CONTROLLER, start(CONTROLLER), GOALS[0])
-    held = state.command.law.integral_kpa, state.watch.n_lost, state.belief.window.spring_m
+    held = state.command.law.integral_kpa, state.belief.n_lost, state.belief.window.spring_m
     arrays = [np.array(value, copy=True) for value in held]
     readings = LinearArm().read_sensors()
     first = step(CONTROLLER, state, readings, False)[0]

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy import safety
-from mjx_softarm.deploy.controller import LOOP, Controller
-from mjx_softarm.deploy.link import VENT_KPA_PER_S
-from mjx_softarm.deploy.safety import Fault, Response
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.link import LATE_TICKS, LOST_TICKS, VENT_KPA_PER_S
+from mjx_softarm.deploy.safety import MOVING_WINDOWS, Fault, Response
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.actions import N_ACTIONS
+from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, correct, extrapolation
 from tests.linear_arm import (
@@ -56,9 +57,9 @@ def test_several_lost_readings_vent(spoil):
     arm = Blind(range(30, 100), spoil)
     run = go(arm)
     assert run.status == 3 and run.arrivals == () and "sensor lost" in run.ending.cause
-    assert run.counts() == {Fault.LOST_READING: LOOP.lost_ticks, Fault.SENSOR_LOST: 1}
+    assert run.counts() == {Fault.LOST_READING: LOST_TICKS, Fault.SENSOR_LOST: 1}
     assert "spring4" in run.events[-1].message
-    assert len(run.log) == 30 + LOOP.lost_ticks
+    assert len(run.log) == 30 + LOST_TICKS
     assert np.abs(arm.written[29]).max() > 1.0
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
@@ -99,7 +100,7 @@ def test_chamber_lost_while_the_goal_moves_vents():
     arm = Leaking(500)
     run = trace(arm, Controller.of(POLICY, between), GOALS[:2], pace_s=30.0)
     assert run.status == 3 and run.counts()[Fault.CHAMBER_LOST] == 1 and len(run.arrivals) == 1
-    assert 500 + LOOP.moving_windows * CONTROLLER.window < len(run.log.goal) < 1000
+    assert 500 + MOVING_WINDOWS * CONTROLLER.window < len(run.log.goal) < 1000
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
 
@@ -129,7 +130,7 @@ def test_arm_that_never_rests_is_counted():
 
     run = go(Swinging(), goals=GOALS[:1])
     assert run.counts()[Fault.NOT_SETTLED] == N_ACTIONS and len(run.arrivals) == 1
-    assert run.log.time_s[run.arrivals[0].row] >= N_ACTIONS * LOOP.settle_timeout_s - 1.0
+    assert run.log.time_s[run.arrivals[0].row] >= N_ACTIONS * SETTLE_TIMEOUT_S - 1.0
 
 
 @pytest.mark.parametrize("goal", [FAR, np.full(6, np.nan), np.zeros(6)])
@@ -172,7 +173,7 @@ def test_missed_deadlines(refuse):
     arm = Slow(range(20, 29), refuse)
     run = go(arm)
     assert run.status == 3 and "arm late" in run.ending.cause
-    assert run.counts() == {Fault.MISSED_DEADLINE: LOOP.late_ticks, Fault.ARM_LATE: 1}
+    assert run.counts() == {Fault.MISSED_DEADLINE: LATE_TICKS, Fault.ARM_LATE: 1}
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
 

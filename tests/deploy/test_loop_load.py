@@ -6,7 +6,8 @@ import functools
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.controller import LOOP, Controller
+from mjx_softarm.deploy import belief, safety
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.observation import layouts
@@ -221,11 +222,12 @@ def test_overload_and_what_no_payload_explains_are_reported(payload_kg, fault, l
 
 
 @pytest.mark.parametrize(("doubt", "counts"), [(1.0, False), (4.0, True)])
-def test_an_estimate_beyond_all_payloads_counts_where_its_interval_holds_one(doubt, counts):
+def test_an_estimate_beyond_all_payloads_counts_where_its_interval_holds_one(doubt, counts, monkeypatch):
+    for module in (belief, safety):
+        monkeypatch.setattr(module, "KNOWN", 1.0)
     model = LOADED.load_estimator._replace(covariance_kpa2=doubt**2 * LOADED.load_estimator.covariance_kpa2)
-    config = dataclasses.replace(LOOP, load_known=1.0)
     policy = dataclasses.replace(LOADED, load_estimator=model)
-    run = follow(LoadedArm(1.85), Controller.of(policy, plan_unloaded, config=config))
+    run = follow(LoadedArm(1.85), Controller.of(policy, plan_unloaded))
     assert (run.log.load_kg[-1] > 1.7) == counts and (Fault.LOAD_UNKNOWN in run.counts()) != counts
 
 
@@ -236,7 +238,7 @@ def test_a_payload_that_the_calibration_does_not_tell_is_not_believed():
         LoadedArm(0.6), Controller.of(dataclasses.replace(LOADED, load_estimator=model), plan_unloaded)
     )
     assert set(run.counts()) == {Fault.LOAD_UNKNOWN} and run.log.load_kg[-1] == 0.0
-    told = "payload not known better than 398 g, expected 300 g: record the poses of `python -m calib plan`"
+    told = "payload not known better than 398 g, expected 300 g: record more random poses"
     assert told in run.events[0].message
 
 

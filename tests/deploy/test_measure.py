@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.accuracy.measure import (
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.ending import DONE, MISSED
+from mjx_softarm.deploy.link import first_frame
+from mjx_softarm.deploy.measure import (
     Accuracy,
     along,
     figures,
@@ -18,9 +21,6 @@ from mjx_softarm.deploy.accuracy.measure import (
     ways_of,
     write_accuracy,
 )
-from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.deploy.ending import DONE, MISSED
-from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses

@@ -8,7 +8,7 @@ from mjx_softarm.control import at_chambers
 from mjx_softarm.deploy.belief import stuck_springs
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drive import Drive, Hold
-from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
+from mjx_softarm.deploy.drivers.names import check_arm, check_number
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import follow

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax import envs
+from brax.training.agents.ars import train as ars
 from brax.training.agents.sac import networks, train
 
 from mjx_softarm._support import xla
@@ -42,6 +43,24 @@ def test_brax_s_wrappers_step_the_arm(env):
     np.testing.assert_array_equal(state.done, 1.0)
     np.testing.assert_array_equal(state.obs, first.obs)
     assert (np.asarray(state.metrics["tip_error_mm"]) > 0).all() and (np.asarray(state.reward) != 0).all()
+
+
+def test_brax_s_ars_trains():
+    """Augmented random search on the closed form: brax compiles MJX for minutes on a CPU."""
+    env = ReachEnv(SHORT, EnvConfig(engine="chain", n_poses=64))
+    make_policy, params, metrics = ars.train(
+        env,
+        num_timesteps=64,
+        episode_length=EPISODE_LENGTH,
+        number_of_directions=4,
+        top_directions=2,
+        num_eval_envs=N_ARMS,
+        seed=1,
+    )
+    assert metrics["eval/avg_episode_length"] == EPISODE_LENGTH and metrics["eval/episode_unsettled"] == 0
+    assert metrics["training/params_norm"] > 0.0  # it begins at zero
+    action, _ = make_policy(params)(jnp.zeros(env.observation_size), jax.random.PRNGKey(0))
+    assert action.shape == (3,) and np.isfinite(action).all()
 
 
 def test_brax_s_sac_trains(env):

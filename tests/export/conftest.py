@@ -10,7 +10,7 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.export import golden_cases
+from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
@@ -73,7 +73,7 @@ def few_golden_rows(run_ticks=30):
     few = {"N_SINGLE": 40, "N_CHECKED": 8, "_CANDIDATES": 60, "_RUN_TICKS": run_ticks}
     with pytest.MonkeyPatch.context() as patch:
         for name, number in few.items():
-            patch.setattr(golden_cases, name, number)
+            patch.setattr(golden_rows, name, number)
         yield
 
 
@@ -92,4 +92,4 @@ def controller(policy_file):
 
 @pytest.fixture(scope="session")
 def golden(controller, policy_file):
-    return golden_cases.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())
+    return golden_rows.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())

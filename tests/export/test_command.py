@@ -6,7 +6,8 @@ import pytest
 
 from mjx_softarm.export.golden import read_golden
 from tests.export.conftest import few_golden_rows
-from train.runs import command
+from train.runs import arm_model
+from train.runs import export as command
 from train.runs.checkpoint import RunError
 
 
@@ -15,8 +16,8 @@ def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
     policy = tmp_path / "policy.npz"
     policy.write_bytes(policy_file.read_bytes())
     monkeypatch.setattr(command, "export_run", lambda run, arm, out: policy)
-    monkeypatch.setattr(command, "arm_model", lambda *arguments: None)
-    monkeypatch.setattr(command, "check_policy", lambda run: None)
+    monkeypatch.setattr(arm_model, "arm_model", lambda *arguments: None)
+    monkeypatch.setattr(command, "actor_of", lambda run: None)
     run = SimpleNamespace(arm=None)
     monkeypatch.setattr(command.Run, "open", lambda path: run)
     with few_golden_rows():
@@ -32,7 +33,9 @@ def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
     }
     names = {path.name for path in (tmp_path / "cpp").iterdir()}
     assert names == {"softarm.hpp", "rows.cpp", "example.cpp", "CMakeLists.txt", "golden.csv"}
-    assert names | beside - {"cpp"} <= {line.split("/")[-1] for line in capsys.readouterr().out.splitlines()}
+    assert names | beside - {"cpp"} <= {
+        line.split("/")[-1].split(",")[0] for line in capsys.readouterr().out.splitlines()
+    }
     golden = read_golden(tmp_path / "cpp" / "golden.csv")
     assert golden.about["policy_sha256"] in (tmp_path / "cpp" / "softarm.hpp").read_text()
 

@@ -11,7 +11,7 @@ import pytest
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.export import golden_cases
+from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import FLAGS, Machine
@@ -57,7 +57,7 @@ def agreeing_rows(policy, folder, run_ticks):
         (folder / name).write_text(text)
     compile_("-O0", folder / "rows.cpp", "-o", folder / "rows")
     with few_golden_rows(run_ticks):
-        golden = golden_cases.make_golden(controller, "ab")
+        golden = golden_rows.make_golden(controller, "ab")
     agreement = check(golden, folder / "rows")
     assert agreement.n_rows > 100 and agreement.error < TOLERANCE, agreement
     return golden

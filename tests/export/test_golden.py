@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.controller import LOOP
-from mjx_softarm.deploy.safety import Fault
-from mjx_softarm.export import computations, golden_cases
+from mjx_softarm.deploy.safety import MOVING_WINDOWS, REST_WINDOWS, Fault
+from mjx_softarm.export import computations
+from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.__main__ import main
 from mjx_softarm.export.check import TOLERANCE, check, compare, without_memory
-from mjx_softarm.export.golden import BITS, FLAGS, read_golden, write_golden
-from mjx_softarm.export.golden_cases import N_SINGLE
+from mjx_softarm.export.golden import BITS, FLAGS, N_SINGLE, read_golden, write_golden
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.runtime import InMotion
 from tests.export.conftest import few_golden_rows
@@ -31,12 +30,7 @@ def test_rows_meet_faults_and_vent(golden, controller):
     at_rest, in_motion = (
         lost - begins[np.searchsorted(begins, lost, "right") - 1] - 60
     )  # ticks after the leak
-    assert (
-        LOOP.rest_windows * controller.window
-        <= at_rest
-        < LOOP.moving_windows * controller.window
-        <= in_motion
-    )
+    assert REST_WINDOWS * controller.window <= at_rest < MOVING_WINDOWS * controller.window <= in_motion
     stopped = np.flatnonzero(faults & BITS[Fault.SENSOR_STUCK])[0]
     pressure_kpa = golden.outputs[stopped:, 2 : 2 + N]
     ramp = np.abs(pressure_kpa[: np.flatnonzero(golden.inputs[stopped + 1 :, 0])[0] + 1])
@@ -127,7 +121,7 @@ def test_fault_that_differs_is_infinitely_off(golden):
 
 def test_a_run_ends_where_rounding_has_added_up(controller, monkeypatch):
     with few_golden_rows():
-        whole = golden_cases.make_golden(controller, "ab")
-        monkeypatch.setattr(golden_cases, "_ROUNDED", 1e-8)
-        cut = golden_cases.make_golden(controller, "ab")
-    assert golden_cases.N_CHECKED < len(cut.inputs) < len(whole.inputs)
+        whole = golden_rows.make_golden(controller, "ab")
+        monkeypatch.setattr(golden_rows, "_ROUNDED", 1e-8)
+        cut = golden_rows.make_golden(controller, "ab")
+    assert golden_rows.N_CHECKED < len(cut.inputs) < len(whole.inputs)

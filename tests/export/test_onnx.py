@@ -11,8 +11,7 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.loop import start, step, with_goal
 from mjx_softarm.export import computations
 from mjx_softarm.export.check import TOLERANCE, check
-from mjx_softarm.export.golden import FLAGS, read_golden
-from mjx_softarm.export.golden_cases import N_SINGLE
+from mjx_softarm.export.golden import FLAGS, N_SINGLE, read_golden
 from mjx_softarm.export.write import export_onnx
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.policy.runtime import PolicyRunner, actor_output

@@ -10,8 +10,7 @@ import pytest
 
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.export.check import TOLERANCE, compare, without_memory
-from mjx_softarm.export.golden import BITS, FLAGS
-from mjx_softarm.export.golden_cases import N_SINGLE
+from mjx_softarm.export.golden import BITS, FLAGS, N_SINGLE
 from mjx_softarm.export.write import export_onnx
 from tests.export.conftest import few_golden_rows
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.small_matrices import eliminate
-from mjx_softarm.mechanics.chain_hessian import ChainHessian
+from mjx_softarm.mechanics.chain_hessian import ChainHessian, solve_approximate_gradient
 
 N_ARMS, N, K = 5, 6, 4
 alone, each = jax.jit(eliminate), jax.jit(jax.vmap(eliminate))
@@ -54,6 +54,20 @@ def test_a_system_with_the_hessian_is_that_with_the_dense_matrix(n_sections):
     np.testing.assert_allclose(found, wanted.reshape(found.shape), atol=1e-5 * np.abs(wanted).max())
     at_once = jax.jit(ChainHessian.solve)(arms_last(hessian), arms_last(columns))
     np.testing.assert_allclose(at_once, arms_last(found), atol=1e-6 * np.abs(wanted).max())
+
+
+def test_an_approximate_gradient_is_by_the_columns_alone():
+    hessian, columns = chain(2)
+
+    def cost(matrix, columns):
+        return jnp.sum(jnp.sin(solve_approximate_gradient(matrix, columns)))
+
+    constant, slope = jax.jit(jax.vmap(jax.grad(cost, argnums=(0, 1))))(hessian, columns)
+    matrix, shape = dense(hessian), (N_ARMS, -1, K)
+    found = np.linalg.solve(matrix, columns.reshape(shape).astype(float))
+    expected = np.linalg.solve(matrix, np.cos(found))
+    np.testing.assert_allclose(slope.reshape(shape), expected, atol=1e-5 * np.abs(expected).max())
+    assert all((x == 0.0).all() for x in jax.tree.leaves(constant))
 
 
 def test_a_matrix_that_is_not_positive_definite_gives_nan_and_its_neighbours_do_not():

@@ -24,10 +24,9 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.motion import midpoint
 from mjx_softarm.mechanics.motion.state import Motion, MotionParams, MovingArm
-from mjx_softarm.mechanics.newton import MAX_ITERATIONS_IN_CONTACT
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import Contact, CrossPipe, clearance
-from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, SettleResult, settle
+from mjx_softarm.mechanics.settle import MAX_ITERATIONS_IN_CONTACT, RESIDUAL_TOLERANCE, SettleResult, settle
 from mjx_softarm.mechanics.statics import statics
 
 SPEC = ArmSpec.default()
@@ -57,7 +56,7 @@ def settled():
     def one(reference):
         params = params_of()
         kinematics = chain_kinematics(params)
-        found = settle(kinematics, params, reference)
+        found = settle(params, reference)
         return found, ball_forces(CONTACT, kinematics(found.q))
 
     return jax.tree.map(np.asarray, xla.jit(jax.vmap(one))(np.float32(references())))
@@ -160,7 +159,7 @@ def test_the_wall_holds_the_arm():
 
     def free(reference):
         params = params_of(contact=None)
-        return settle(chain_kinematics(params), params, reference).q
+        return settle(params, reference).q
 
     outside_m = jax.jit(jax.vmap(lambda r: depth_m(free(r))))(np.float32(references()))
     inside_m = np.asarray(jax.jit(jax.vmap(depth_m))(found.q))
@@ -179,10 +178,9 @@ def test_the_implicit_derivative_is_along_central_differences():
 
     with jax.enable_x64(True):
         params = params_of(np.float64)
-        kinematics = chain_kinematics(params)
 
         def along(reference):
-            found = settle(kinematics, params, reference)
+            found = settle(params, reference)
             return jnp.sum(weight * found.tip_position_m), found
 
         gradient = jax.jit(jax.vmap(jax.grad(along, has_aux=True)))
@@ -213,7 +211,7 @@ def test_an_arm_in_motion_comes_to_rest_where_it_settles():
 
     def go(reference):
         arm = MovingArm(model, data, jax.tree.map(jnp.asarray, params), MotionParams())
-        begin = settle(chain_kinematics(params), params, params.spring_rest_m)
+        begin = settle(params, params.spring_rest_m)
         motion = Motion.at_rest(begin.q, begin.pressure_kpa, begin.spring_m)
         motion, end = midpoint.advance(arm, motion, reference, gains, 8.0, 0.02, 0.02)
         return end, jnp.linalg.norm(ball_forces(CONTACT, chain_kinematics(params)(motion.q)), axis=0).sum()

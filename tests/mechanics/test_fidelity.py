@@ -17,7 +17,6 @@ import pytest
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
 from mjx_softarm._support.lazy import mjx
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
@@ -102,8 +101,8 @@ def truth(n, seed, spec=SPEC):
 @functools.cache
 def settled(n, seed, spec=SPEC):
     """`settle` at the same references."""
-    kinematics = chain_kinematics(params := ArmParams.from_spec(spec))
-    many = xla.jit(jax.vmap(lambda x: settle(kinematics, params, x)))
+    params = ArmParams.from_spec(spec)
+    many = xla.jit(jax.vmap(lambda x: settle(params, x)))
     return jax.device_get(many(np.float32(references(n, seed, spec))))
 
 

@@ -38,10 +38,6 @@ def seen(found):
     return {name: getattr(found, name) for name in SEEN}
 
 
-def chain_settle(params, reference):
-    return settle(chain_kinematics(params), params, reference)
-
-
 def equilibrium_of_set(params, reference, q, pressure, at_limit, at_high):
     """Fields of the equilibrium that holds the chambers `at_limit`, by dense Newton steps from near it."""
     limit = jnp.where(at_high, params.pressure_max_kpa, params.pressure_min_kpa)
@@ -92,7 +88,7 @@ def comparison(spec):
             params = jax.tree.map(lambda x, d: x * (1.0 + shares[1] * step * d), params, arm)
             return params, reference + shares[0] * step * turn
 
-        found, slope = jax.jvp(lambda step: chain_settle(*moved(step)), (jnp.zeros(()),), (jnp.ones(()),))
+        found, slope = jax.jvp(lambda step: settle(*moved(step)), (jnp.zeros(()),), (jnp.ones(()),))
         at_high = found.pressure_kpa >= SPEC.chambers.pressure_max_kpa
         start, step = (found.q, found.pressure_kpa, found.at_limit, at_high), 1e-5
         signs = jnp.array([1.0, -1.0])
@@ -135,7 +131,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode():
 
     def both(reference, turn):
         def fields(params, reference):
-            return seen(chain_settle(params, reference))
+            return seen(settle(params, reference))
 
         primals, tangents = (params, reference), (direction, turn)
         _, push = jax.linearize(fields, *primals)
@@ -159,7 +155,7 @@ def test_held_pressures_have_the_derivative_of_their_own_equilibrium():
 
         @jax.jit
         def both(pressure):
-            q, push = jax.linearize(lambda p: settle_pressures(kinematics, params, p).q, pressure)
+            q, push = jax.linearize(lambda p: settle_pressures(params, p).q, pressure)
             here = statics(kinematics(q), q, pressure, params)
             expected = jnp.linalg.solve(here.hessian.dense(), here.push_per_kpa.reshape(-1, 3))
             return jax.vmap(push, out_axes=1)(jnp.eye(3)), expected
@@ -173,7 +169,7 @@ def test_an_arm_that_does_not_settle_has_a_zero_derivative():
     reference[3, 0] = np.nan
 
     def fields(reference, spring_rest_m):
-        found = chain_settle(params._replace(spring_rest_m=spring_rest_m), reference)
+        found = settle(params._replace(spring_rest_m=spring_rest_m), reference)
         return seen(found), found
 
     @functools.partial(jax.vmap, in_axes=(0, None))

@@ -7,7 +7,6 @@ import pytest
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.lazy import put
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.mjx_rest import measured
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
@@ -28,7 +27,7 @@ def at_rest(request):
     params.tool_mass_kg[PAYLOAD] = LOADED_KG
     shortest, longest = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
     reference = np.random.default_rng(0).uniform(shortest, longest, (N, spec.n_springs)).astype(np.float32)
-    solve = jax.vmap(lambda r: settle(chain_kinematics(params), params, r))
+    solve = jax.vmap(lambda r: settle(params, r))
     proposed = xla.jit(solve)(reference)
     assert proposed.settled.all() and np.asarray(proposed.at_limit).any(axis=1).mean() > 0.25
     model, data = put(build_model(spec))

@@ -10,11 +10,10 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import allocated_error, allocation
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
-from mjx_softarm.mechanics.newton import MAX_ITERATIONS
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import (
+    MAX_ITERATIONS,
     RESIDUAL_TOLERANCE,
     TRACKING_TOLERANCE_M,
     SettleResult,
@@ -32,7 +31,7 @@ N = 128  # arms a batch, always, so that little is compiled
 
 @functools.cache
 def solver():
-    return jax.jit(jax.vmap(lambda params, x: settle(chain_kinematics(params), params, x), in_axes=(None, 0)))
+    return jax.jit(jax.vmap(lambda params, x: settle(params, x), in_axes=(None, 0)))
 
 
 def settled(solve, target, spec=SPEC, params=None):
@@ -240,10 +239,7 @@ def softened(softer, reference_m, n_at_once=None):
         chamber_site_m=params.chamber_site_m * softer**0.1,
         mount=params.mount._replace(tip_offset_m=params.mount.tip_offset_m + 0.01 * softer),
     )
-    kinematics = chain_kinematics(params)
-    found, change = jax.jvp(
-        lambda x: settle(kinematics, params, x, n_at_once), (reference_m,), (0.1 * reference_m,)
-    )
+    found, change = jax.jvp(lambda x: settle(params, x, n_at_once), (reference_m,), (0.1 * reference_m,))
     return jnp.stack([found.tip_position_m, change.tip_position_m])
 
 

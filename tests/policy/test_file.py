@@ -19,13 +19,12 @@ from mjx_softarm.control import Gains, allocation
 from mjx_softarm.mdp.observation import OBS_LAYOUT, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
-from mjx_softarm.policy.actor import policy_from_actor
-from mjx_softarm.policy.file import load_policy, save_policy
+from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
-# Digest of the names that schema 15 stores and of the fields of its specification.
-SCHEMA_15 = "6eb5df38"
+# Digest of the names that schema 16 stores and of the fields of its specification.
+SCHEMA_16 = "89803db7"
 TWO_SECTIONS = ArmSpec.default().replace(structure={"n_sections": 2})
 
 
@@ -120,7 +119,7 @@ def test_parts_are_those_of_the_arm(file):
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
-    assert arrays["schema_version"] == 15 and arrays["s2r_kind"] == "mlp"
+    assert arrays["schema_version"] == 16 and arrays["s2r_kind"] == "mlp"
     parts, axes = ("pose", "goal", "error"), ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
     assert arrays["obs_layout"].tolist() == [f"{part}_{axis}" for part in parts for axis in axes]
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
@@ -209,8 +208,8 @@ def test_files_that_are_no_policy(tmp_path):
 
 
 def test_another_schema_is_named_before_anything_else(file):
-    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(14))
-    assert refusal(file) == "schema_version: got 14, expected 15: export the run again, or train it anew"
+    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(15))
+    assert refusal(file) == "schema_version: got 15, expected 16: export the run again, or train it anew"
 
 
 def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file, hold):
@@ -243,7 +242,7 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
         ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 15"),
+        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 16"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
         ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
@@ -282,12 +281,12 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, m
     assert file.read_bytes() == before
 
 
-def test_schema_15_stays_as_it_is(file, make_policy):
+def test_schema_16_stays_as_it_is(file, make_policy):
     groups = make_policy().spec.to_dict().items()
     fields = [f"{name}.{item}" for name, group in groups if isinstance(group, dict) for item in group]
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
-    assert digest == SCHEMA_15, "other entries, or other fields of ArmSpec: raise SCHEMA_VERSION?"
+    assert digest == SCHEMA_16, "other entries, or other fields of ArmSpec: raise SCHEMA_VERSION?"
 
 
 def test_the_policies_that_ship_are_small_and_one_is_calibrated():

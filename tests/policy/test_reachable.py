@@ -5,7 +5,7 @@ import pytest
 
 from mjx_softarm.deploy.loop import start, with_goal
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.policy.reachable import Reachable, clamped, nearest
+from mjx_softarm.policy.reach import Reachable, clamped, nearest
 from tests.linear_arm import CONTROLLER, FAR, GOALS
 
 

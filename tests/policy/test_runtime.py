@@ -1,4 +1,4 @@
-"""The deployed policy against the one that was trained, without JAX in its process."""
+"""The deployed policy against the one that was trained; NumPy alone in its process."""
 
 import dataclasses
 import subprocess
@@ -16,19 +16,26 @@ from mjx_softarm.deploy import PolicyRunner, load_policy
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.workspace import Pool
-from mjx_softarm.policy.actor import policy_from_actor
-from mjx_softarm.policy.file import save_policy
+from mjx_softarm.policy.file import policy_from_actor, save_policy
 from train.agent.networks import Actor, mode
 
 N = 1000
-WITHOUT_JAX = """
+WITH_NUMPY_ALONE = """
 import sys
+
+class Refusing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] not in {"mjx_softarm", "numpy", *sys.stdlib_module_names}:
+            raise ImportError(f"{name} is refused")
+
+sys.meta_path.insert(0, Refusing())
+import importlib
 from mjx_softarm.deploy import PolicyRunner, load_policy
 
+for name in ("session", "record", "measure", "budget", "capture", "drivers.names", "drivers.ldc1612"):
+    importlib.import_module(f"mjx_softarm.deploy.{name}")
 reference = PolicyRunner(load_policy(sys.argv[1])).act([0, 0, -600, 0, 0, 0], [50, 0, -580, 0, 0, 0])
 assert reference.length_m.shape == (9,)
-loaded = {name.split(".")[0] for name in sys.modules}
-print(sorted(loaded & {"jax", "jaxlib", "flax", "brax", "mujoco", "train"}))
 """
 
 
@@ -71,10 +78,10 @@ def poses():
     return rng.uniform(low, high, (2, N, 6)).astype(np.float32)
 
 
-def test_loads_and_acts_without_jax(file):
-    command, root = [sys.executable, "-c", WITHOUT_JAX, file], Path(__file__).resolve().parents[2]
+def test_an_arm_s_computer_needs_numpy_alone(file):
+    command, root = [sys.executable, "-c", WITH_NUMPY_ALONE, file], Path(__file__).resolve().parents[2]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "[]\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, monkeypatch):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_softarm.twin.hysteresis import StopOperators
+from mjx_softarm.twin.arm import StopOperators
 
 
 def test_hysteresis_loop_has_the_area_of_the_closed_form():

@@ -20,7 +20,7 @@ def held(window_m=REST_M, lost=False, goal=None, **command):
     state, spring_m = start(CONTROLLER), np.full(N, REST_M)
     window = state.belief.window._replace(spring_m=np.full((CONTROLLER.window, N), window_m))
     belief = dataclasses.replace(
-        state.belief, spring_m=spring_m, window=window, lost=np.full(N, False) | lost
+        state.belief, spring_m=spring_m, window=window, n_lost=np.zeros(N, int) + lost
     )
     command = state.command._replace(**({"reference_m": spring_m} | command))
     return state._replace(belief=belief, command=command, goal=goal)

@@ -20,8 +20,9 @@ from jax import Array
 from calib.arm import CalibratedArm
 from calib.fit.payload import effect_of_s2r, held_at
 from calib.fit.s2r import simulate_poses
-from mjx_softarm._support.training import Schedule, train_network
+from mjx_softarm._support.training import Schedule, initial_layers, train_network
 from mjx_softarm._support.xp import array_namespace
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import (
     CANDIDATES_PER_POSE,
     HELD_OUT_SEED,
@@ -32,6 +33,7 @@ from mjx_softarm.mechanics.workspace import (
 )
 from mjx_softarm.posture import hangs
 from mjx_softarm.sensing.estimator import (
+    N_CHANGES,
     PoseEstimator,
     SpringModel,
     estimate_frame,
@@ -39,6 +41,7 @@ from mjx_softarm.sensing.estimator import (
 )
 from mjx_softarm.sensing.held_pressures import held_kpa, residual
 from mjx_softarm.sensing.load import (
+    COMMON_FACTOR,
     HIGHEST,
     LOWEST,
     LoadEstimator,
@@ -47,7 +50,6 @@ from mjx_softarm.sensing.load import (
 )
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
-from train.runs.first_networks import first_estimator, first_load_estimator, first_spring_model
 
 N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 2_048, 2_048
 MORE_PRESSURE = 0.25  # share of the pressure range that is added at either end
@@ -57,6 +59,10 @@ PRESSURE_WEIGHT = 4.0  # of the pressures in its loss: they tell the payload mor
 PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
+WIDTH = 128  # width of the networks' hidden layers
+LEAST_SCALE = 1e-6  # least scale of an output off its plane: without a log, one variance holds everywhere
+CHANGE_SCALE = 0.015  # scale of the pose network's outputs, in mean section lengths and half radians
+N_STEPS = 6  # steps that `distil` reports
 
 
 class Error(NamedTuple):
@@ -76,12 +82,13 @@ class Distilled(NamedTuple):
     errors: dict[str, dict[float, Error]]  # by quantity and payload [kg], see `_errors`
 
 
-def distil(arm: CalibratedArm, seed: int) -> Distilled:
+def distil(arm: CalibratedArm, seed: int, say: Callable[[str], object] = lambda step: None) -> Distilled:
     """Return the networks of an arm; the same seed gives the same networks.
 
     Args:
         arm: the arm, calibrated or not.
         seed: seed of the equilibria, the initial weights and the batches.
+        say: takes a text before each of the `N_STEPS` steps.
 
     Raises:
         ValueError: the seed draws the held-out equilibria.
@@ -91,17 +98,23 @@ def distil(arm: CalibratedArm, seed: int) -> Distilled:
         raise ValueError(f"seed: got {seed}, which draws the held-out equilibria, expected another")
     spec, keys = arm.spec, _keys(seed)
     # Learn the pose of the arm as specified, then how a load changes it.
+    say("simulating poses")
     pool = sample_workspace(_stronger(spec), N_TRAINING, seed)
     load_kg = np.full(len(pool.pose), spec.mass.payload_kg, np.float32)
     poses = LoadedPool(load_kg, pool.pressure_kpa, pool.spring_m, pool.pose)
     loaded = loaded_poses(arm, N_TRAINING, seed)
-    estimator = _fit(first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
+    say("training the pose estimator")
+    estimator = _fit(_first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
+    say("training the pose estimator with payloads")
     estimator = _fit(estimator, _pose_loss, loaded, keys[2], "load_layers")
     # Learn what holds the arm, with a payload and without, and the springs of the unloaded arm.
+    say("training the payload estimator")
     load_estimator = fit_load_estimator(arm, loaded, seed)
+    say("training the model of the springs")
     unloaded = _as_measured(arm, sample_workspace(spec, N_TRAINING, seed))
-    springs = _fit(first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
+    springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
     # Test them.
+    say("testing them at held-out poses")
     learned = Distilled(estimator, load_estimator, springs, {})
     learned = jax.tree.map(lambda x: np.asarray(x, np.float32), learned)
     return learned._replace(errors=_errors(learned, arm))
@@ -135,13 +148,13 @@ def fit_load_estimator(arm: CalibratedArm, loaded: LoadedPool, seed: int) -> Loa
     else:
         mean_kpa, share = residual(held, spring_m, light_kpa)
         covariance, left_kpa = held.covariance_kpa2, mean_kpa.reshape(light_kpa.shape)
-    held_at_kpa = light_kpa + left_kpa + spec.unmodelled_kpa(spring_m)
+    held_at_kpa = light_kpa + left_kpa + spec.unmodelled_kpa
     # Learn, and judge by poses that are not learned
     out = np.float32(np.concatenate([held_at_kpa, effect, np.log(share)], axis=1))
     parts = np.split(spring_m, [-N_JUDGING]), np.split(out, [-N_JUDGING])
     learned, judging = (_Holding(*map(jnp.asarray, part)) for part in zip(*parts, strict=True))
     keys = _keys(seed)
-    first = first_load_estimator(arm, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
+    first = _first_load_estimator(arm, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
     network = _fit(first, _holding_loss, learned, keys[4], n_schedules=LOAD_SCHEDULES)
     # The network's own error. It is larger at the rim, so the intervals of 95 % of these poses shall hold it.
     found_kpa = holding(network, judging.spring_m).pressure_kpa
@@ -202,7 +215,7 @@ def _held(
     kpa = light_kpa + effect_kpa
     if arm.held is not None:
         kpa = held_kpa(arm.held, spring_m, light_kpa, effect_kpa, rng)
-    return kpa + arm.spec.unmodelled_kpa(spring_m)
+    return kpa + arm.spec.unmodelled_kpa
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:
@@ -252,6 +265,81 @@ def _fit(
 
     weights, _ = train_network(loss_of, getattr(network, layers), pool, schedule, key)
     return network._replace(**{layers: weights})
+
+
+def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimator:
+    """Return the pose network of an arm, scaled by poses of it; a load changes little at first."""
+    n_sections = spec.structure.n_sections
+    n_in, n_out = spec.n_springs + 3 * n_sections, N_CHANGES * n_sections
+    scale = np.full(N_CHANGES, CHANGE_SCALE)
+    scale[:3] *= spec.length_m / n_sections
+    params = ArmParams.from_spec(spec)
+    site_m = jnp.asarray(params.spring_site_m)
+    load_layers = initial_layers(jax.random.fold_in(key, 1), (n_in + 1, WIDTH, WIDTH, n_out))
+    *hidden, (weight, bias) = load_layers
+    return PoseEstimator(
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
+        load_layers=(*hidden, (0.1 * weight, bias)),
+        spring_site_m=site_m,
+        **_scaling("spring", "m", pool.spring_m),
+        load_centre_kg=jnp.asarray(spec.mass.payload_kg),
+        load_scale_kg=jnp.asarray(spec.mass.largest_payload_kg),
+        change_scale=jnp.asarray(scale),
+        base_position_m=jnp.asarray(params.mount.base_position_m),
+        base_rotation=jnp.asarray(params.mount.base_rotation),
+    )
+
+
+def _first_load_estimator(
+    arm: CalibratedArm, spring_m: Array, out: Array, covariance_kpa2: Array, key: Array
+) -> LoadEstimator:
+    """Return the payload network of an arm, with the plane that fits its outputs best.
+
+    Args:
+        arm: the arm, whose residual pressures tell the hysteresis.
+        spring_m (n, n_springs) [m]: spring lengths.
+        out (n, n_out): outputs of `LoadEstimator` there.
+        covariance_kpa2 (n_sections, c, c): covariance of the residual pressures.
+        key: key of the weights.
+    """
+    scaling, centre = _scaling("spring", "m", spring_m), jnp.mean(out, axis=0)
+    springs = (spring_m - scaling["spring_centre_m"]) / scaling["spring_scale_m"]
+    slope = jnp.linalg.lstsq(springs, out - centre)[0]
+    rest = jnp.std(out - centre - springs @ slope, axis=0)
+    (n_in, n_out), own_kg = slope.shape, arm.spec.mass.payload_kg
+    held, at_chambers = arm.held, arm.spec.at_chambers
+    return LoadEstimator(
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
+        slope=slope,
+        **scaling,
+        out_centre=centre,
+        out_scale=jnp.maximum(rest, LEAST_SCALE),
+        covariance_kpa2=covariance_kpa2,
+        error_kpa2=jnp.zeros_like(covariance_kpa2),
+        hysteresis_kpa=jnp.asarray(at_chambers(0.0 if held is None else tuple(held.hysteresis_kpa))),
+        stroke_m=jnp.asarray(at_chambers(1.0 if held is None else tuple(held.stroke_m))),
+        own_load_kg=jnp.asarray(own_kg),
+        load_scale_kg=jnp.asarray(own_kg + arm.spec.mass.largest_payload_kg),
+        factor_sd=jnp.asarray(COMMON_FACTOR if held is None else held.factor_sd),
+    )
+
+
+def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
+    """Return the network from pressures to springs, scaled by poses of an arm."""
+    n_chambers, n_springs = pool.pressure_kpa.shape[1], pool.spring_m.shape[1]
+    return SpringModel(
+        layers=initial_layers(key, (n_chambers, WIDTH, WIDTH, n_springs)),
+        **_scaling("pressure", "kpa", pool.pressure_kpa),
+        **_scaling("spring", "m", pool.spring_m),
+    )
+
+
+def _scaling(name: str, unit: str, values: Array) -> dict[str, Array]:
+    """Return the fields of a network that standardise a quantity (n, ...)."""
+    return {
+        f"{name}_centre_{unit}": jnp.mean(values, axis=0),
+        f"{name}_scale_{unit}": jnp.std(values, axis=0),
+    }
 
 
 def _errors(learned: Distilled, arm: CalibratedArm) -> dict[str, dict[float, Error]]:

@@ -56,7 +56,7 @@ class Delay:
     def __init__(self) -> None:
         self._offset_s, self._frame_s, self._now_s = np.inf, -np.inf, 0.0
 
-    def of(self, frame_s: float, now_s: float) -> float:
+    def measure(self, frame_s: float, now_s: float) -> float:
         """Return the delay [s] of a frame with a time [s] on its own clock, taken at a time [s] on ours."""
         # After a while without frames the system may have begun anew, and its clock with it.
         if frame_s < self._frame_s or now_s - self._now_s > LOST_S:
@@ -134,7 +134,7 @@ class CapturedArm:
         name, frame = self._name, self._newest()
         if frame is None:
             raise TimeoutError(f"got no new frame from {name.host}")
-        delay_s = self._delay.of(frame.time_s, time.monotonic())
+        delay_s = self._delay.measure(frame.time_s, time.monotonic())
         if name.base:
             self._base = frame.bodies.get(name.base, self._base)
         if delay_s > LATE_S:
@@ -195,7 +195,9 @@ def _check_place(seen: Capture, spec: ArmSpec, where: str) -> None:
     turn = expected_axes.T @ rotation_from_quaternion(seen.tip_quaternion)
     turn_deg = np.degrees(np.linalg.norm(rotation_vector(turn)))
     if off_m > _NEAR * spec.length_m or turn_deg > _TURNED_DEG:
-        got, expected = (", ".join(f"{1e3 * x:.0f}" for x in at_m) for at_m in (seen.tip_m, expected_m))
+        got, expected = (
+            ", ".join(f"{1e3 * x:.0f}" for x in position_m) for position_m in (seen.tip_m, expected_m)
+        )
         raise InputError(
             f"{where}: got the tip at {got} mm, turned by {turn_deg:.0f} deg, expected it near {expected} "
             "mm, the end of the straight arm: is the origin the base, and is up=y or up=z right?"

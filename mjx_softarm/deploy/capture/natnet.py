@@ -60,9 +60,9 @@ class NatNet:
 
         # Bodies and markers, as the server describes them
         described, where = self._described, f"--capture natnet:{name.host}"
-        sets = {found.name: len(found.marker_names) for found in described.marker_sets}
+        sets = {one.name: len(one.marker_names) for one in described.marker_sets}
         for body in (name.body, name.base):
-            check_names(where, "body", body, sorted(found.name for found in described.rigid_bodies))
+            check_names(where, "body", body, sorted(one.name for one in described.rigid_bodies))
         check_names(where, "marker set", name.markers, sorted(sets))
         self._n_markers = sets.get(name.markers, 0)
 
@@ -86,7 +86,7 @@ class NatNet:
 
     def _connect(self, multicast: bool) -> Any:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect((self._host, COMMAND_PORT))  # sends nothing; tells which of our addresses it is
+            probe.connect((self._host, COMMAND_PORT))  # sends nothing; shows which of our addresses is used
             local = probe.getsockname()[0]
         client = self._package.NatNetClient(
             self._host, local, command_port=COMMAND_PORT, data_port=DATA_PORT, use_multicast=multicast
@@ -143,9 +143,9 @@ class NatNet:
             if body.id_num in names and body.tracking_valid is not False  # None before NatNet 2.6
         }
         marker_m = np.full((self._n_markers, 3), np.nan)
-        for found in frame.marker_sets:
-            if found.model_name == self._name.markers and len(found.marker_pos_list) == self._n_markers:
-                marker_m = np.array(found.marker_pos_list).reshape(-1, 3)
+        for one in frame.marker_sets:
+            if one.model_name == self._name.markers and len(one.marker_pos_list) == self._n_markers:
+                marker_m = np.array(one.marker_pos_list).reshape(-1, 3)
         marker_m[(marker_m == 0.0).all(axis=1)] = np.nan  # a hidden marker stands at the origin
         return CaptureFrame(frame.suffix.timestamp, self._latency(frame.suffix), bodies, marker_m)
 

@@ -1,7 +1,7 @@
 """Frames of Qualisys Track Manager over its real-time protocol, by the package `qtm-rt`.
 
 Positions come in millimetres, axes as a matrix column by column. Unseen bodies and markers are NaN. QTM does
-not tell how old a frame is when it is sent.
+not report how old a frame is when it is sent.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Qualisys:
     def __init__(self, name: CaptureName):
         with needing("capture", "--capture"):
             self._package = importlib.import_module("qtm_rt.qrt")
-        logging.getLogger("qtm_rt").addHandler(logging.NullHandler())  # this class tells its errors
+        logging.getLogger("qtm_rt").addHandler(logging.NullHandler())  # this class reports its errors
         self._name = name
         self._host = socket.gethostbyname(name.host)  # looked up once, not in the loop
         self._error: Exception | None = None  # error of the last try to connect again
@@ -82,7 +82,7 @@ class Qualisys:
         try:
             await self._connect()
             self._error = None
-        except Exception as error:  # it is tried again, and `poll` tells why
+        except Exception as error:  # it is tried again, and `poll` says why
             self._error = error
             await asyncio.sleep(AGAIN_S)
 
@@ -124,11 +124,11 @@ class Qualisys:
         settings = await connection.get_parameters(["6d", "3d"])
 
         # Places of bodies and markers in frames, by the order of QTM's settings
-        found = xml.etree.ElementTree.fromstring(settings)
-        self._bodies = [node.text or "" for node in found.findall("*/Body/Name")]
+        tree = xml.etree.ElementTree.fromstring(settings)
+        self._bodies = [node.text or "" for node in tree.findall("*/Body/Name")]
         for body in (name.body, name.base):
             check_names(where, "body", body, self._bodies)
-        labels = [node.text or "" for node in found.findall("*/Label/Name")]
+        labels = [node.text or "" for node in tree.findall("*/Label/Name")]
         self._markers = numbered(name.markers, labels) if name.markers else []
         if name.markers and not self._markers:
             check_names(where, "marker", f"{name.markers}0", labels)

@@ -21,7 +21,7 @@ class CaptureFrame(NamedTuple):
 
     Attributes:
         time_s: time [s] on the system's clock.
-        latency_s: time [s] from the cameras' exposure to sending; NaN where the system does not tell it.
+        latency_s: time [s] from the cameras' exposure to sending; NaN where the system does not report it.
         bodies: origin (3,) [m] and axes (3, 3), as columns, of each rigid body that is seen.
         marker_m (n_markers, 3) [m]: NaN for a marker that is not seen.
     """
@@ -73,10 +73,10 @@ class CaptureName:
         if system not in _DEFAULT_UP or not host or not body or not named_well:
             expected = "natnet:HOST:BODY or qualisys:HOST:BODY, maybe with ,base=BODY,markers=NAME,up=y|z"
             raise InputError(f"--capture: got {text!r}, expected {expected}")
-        found = cls(system, host, body, **{"up": _DEFAULT_UP[system]} | named)
-        if found.up not in UP:
-            raise InputError(f"--capture: got up={found.up}, expected y or z")
-        return found
+        name = cls(system, host, body, **{"up": _DEFAULT_UP[system]} | named)
+        if name.up not in UP:
+            raise InputError(f"--capture: got up={name.up}, expected y or z")
+        return name
 
 
 def check_names(where: str, kind: str, asked: str, known: list[str]) -> None:
@@ -91,9 +91,9 @@ def check_names(where: str, kind: str, asked: str, known: list[str]) -> None:
 
 def numbered(prefix: str, labels: list[str]) -> list[int]:
     """Return the places of the labels PREFIX0, PREFIX1, ..., in the order of their numbers."""
-    found = {
+    places = {
         int(label[len(prefix) :]): k
         for k, label in enumerate(labels)
         if re.fullmatch(re.escape(prefix) + r"\d+", label)
     }
-    return [found[number] for number in sorted(found)]
+    return [places[number] for number in sorted(places)]

@@ -51,14 +51,16 @@ class LdcSprings:
         self, channels: Sequence[Sequence[int]], drive_current: int = 18, timeout_s: float = 0.008
     ) -> None:
         # Springs by converter
-        for at in channels:
-            if not isinstance(at, Sequence) or [*map(type, at)] != [int, int, int]:
-                raise ValueError(f"channels: got {at}, expected bus, address and channel of each spring")
+        for place in channels:
+            if not isinstance(place, Sequence) or [*map(type, place)] != [int, int, int]:
+                raise ValueError(f"channels: got {place}, expected bus, address and channel of each spring")
         self._springs: dict[tuple[int, int], dict[int, int]] = {}
         for spring, (bus, address, channel) in enumerate(channels):
             self._springs.setdefault((bus, address), {})[channel] = spring
         n_known = sum(map(len, self._springs.values()))
-        if n_known != len(channels) or not all({*at} <= {0, 1, 2, 3} for at in self._springs.values()):
+        if n_known != len(channels) or not all(
+            {*springs} <= {0, 1, 2, 3} for springs in self._springs.values()
+        ):
             raise ValueError(
                 f"channels: got {channels}, expected a channel 0 to 3 of its own for each spring"
             )
@@ -73,22 +75,22 @@ class LdcSprings:
         for bus in {bus for bus, _ in self._springs}:
             self._buses[bus] = self._smbus.SMBus(bus)
             fcntl.ioctl(self._buses[bus].fd, I2C_TIMEOUT, BUS_TIMEOUT)
-        for (bus, address), at in self._springs.items():
-            self._start(bus, address, sorted(at), drive_current)
+        for (bus, address), springs in self._springs.items():
+            self._start(bus, address, sorted(springs), drive_current)
 
     def read_sensors(self) -> np.ndarray:
         """Return the frequencies (n,) [Hz]; NaN for a spring that was not read."""
         end_s = time.monotonic() + self._timeout_s
         readings = np.full(self._n, np.nan)
-        for (bus, address), at in self._springs.items():
+        for (bus, address), springs in self._springs.items():
             if time.monotonic() > end_s:
                 break
-            registers = [STATUS, *(DATA_MSB + 2 * channel + word for channel in at for word in (0, 1))]
+            registers = [STATUS, *(DATA_MSB + 2 * channel + word for channel in springs for word in (0, 1))]
             try:
                 status, *words = self._read(bus, address, registers)
             except OSError:  # this converter's springs are not read; all of them end the run
                 continue
-            for (channel, spring), high, low in zip(at.items(), words[::2], words[1::2], strict=True):
+            for (channel, spring), high, low in zip(springs.items(), words[::2], words[1::2], strict=True):
                 unread, errors = status >> (3 - channel) & 1, high >> 12
                 if unread and not errors:
                     readings[spring] = ((high << 16) | low) * CLOCK_HZ / 2**28
@@ -98,11 +100,11 @@ class LdcSprings:
         """Set a converter going round its channels."""
         where = f"LDC1612 at bus {bus}, address {address:#x}"
         try:
-            found = self._read(bus, address, list(IDS))
+            ids = self._read(bus, address, list(IDS))
         except OSError as error:
             raise OSError(f"{where}: got {error.strerror or error}, expected an answer") from error
-        if found != [*IDS.values()]:
-            raise OSError(f"{where}: got ids {found}, expected {[*IDS.values()]}")
+        if ids != [*IDS.values()]:
+            raise OSError(f"{where}: got ids {ids}, expected {[*IDS.values()]}")
         self._write(bus, address, RESET_DEV, 0x8000)  # into sleep mode
         divider = DIVIDER_OF_ONE if len(channels) == 1 else 1
         steps_per_s = CLOCK_HZ / divider / 16

@@ -1,14 +1,14 @@
-"""Arms by name.
+"""Arms by name, and checks before any pressure that an arm is the one of a specification or of a policy.
 
     package.module:Class   a driver
-    wiring.toml            hardware by its settings (`mjx_softarm.deploy.drivers.wiring`)
+    wiring.toml            an arm at a serial line (`mjx_softarm.deploy.drivers.serial_line`)
     twin:SEED              a twin; `twin:rod:SEED` is a rod; `twin:SEED@ARM` has another arm, as for `--spec`
 
 Options follow a twin's name, in this order: `:pipe300`, or another name of
 `mjx_softarm.mechanics.pipe.PIPES`, puts it into a pipe. `:aged` is the same
 arm some months later: each spring's zero is 1 mm off, and the chambers are 5 % softer. `:exact` has all parts
 as specified, with friction, hysteresis and noise. `:lost4` takes the pressure of chamber 4. `:500g` hangs a
-payload of 500 g to it.
+payload of 500 g on it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,25 @@ import importlib
 import os
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.drivers.wiring import wired
+from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.drivers.serial_line import SerialArm
+from mjx_softarm.deploy.link import LOST_TICKS
+from mjx_softarm.sensing.estimator import expected_springs
+from mjx_softarm.spec import ArmSpec
 
 _TWIN = "mjx_softarm.twin.names"  # imported only when asked for, since it needs MuJoCo
 _METHODS = ("read_sensors", "write_pressures")
+# Deviation of another arm's mean spring length, in mean section lengths; by hand. A payload of 1 kg: 0.05.
+_OTHER_LENGTH = 0.25
+_ANOTHER = "is it another arm, or not yet switched on"
 
 
 def open_arm(name: str) -> Any:
@@ -41,7 +50,7 @@ def open_arm(name: str) -> Any:
     """
     # Hardware by its settings
     if name.endswith(".toml") and ":" not in name:
-        return wired(Path(name))
+        return _wired(Path(name))
 
     # A twin
     module_name, _, item = name.partition(":")
@@ -56,8 +65,8 @@ def open_arm(name: str) -> Any:
             raise InputError(f"--arm: {error}") from error
 
     # A driver's class
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.insert(0, here)
+    if (folder := os.getcwd()) not in sys.path:
+        sys.path.insert(0, folder)
     try:
         kind = getattr(importlib.import_module(module_name), item)
     except ImportError as error:
@@ -73,6 +82,32 @@ def open_arm(name: str) -> Any:
     except (ImportError, OSError, TypeError, ValueError) as error:
         got = f"{type(error).__name__}: {error}"
         raise InputError(f"--arm {name}: got {got}; expected an arm that opens") from error
+
+
+def _wired(path: Path) -> SerialArm:
+    """Open the arm that a file describes.
+
+    Raises:
+        InputError: the file cannot be read, names another table, driver or setting, or the arm cannot be
+            reached.
+    """
+    where = f"--arm {path}"
+    try:
+        tables = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{where}: got {error}, expected a TOML file") from error
+    table = tables.get("arm")
+    if {*tables} != {"arm"} or not isinstance(table, dict) or table.get("driver") != "serial":
+        raise InputError(f'{where}: got {tables}, expected the table arm with driver = "serial"')
+    # Settings are the class attributes that a class of one's own would have.
+    settings = {key: value for key, value in table.items() if key != "driver"}
+    known = list(SerialArm.__annotations__)
+    if unknown := settings.keys() - {*known}:
+        raise InputError(f"{where}: got {', '.join(sorted(unknown))}, expected some of {', '.join(known)}")
+    try:
+        return type("Arm", (SerialArm,), settings)()
+    except (OSError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: got {type(error).__name__}: {error}") from error
 
 
 def twin_spec(name: str) -> Path | None:
@@ -96,3 +131,60 @@ class Paced:
         left_s = self._began_s + self._arm.time_s - time.monotonic()
         self._began_s -= min(left_s, 0.0)
         time.sleep(max(left_s, 0.0))
+
+
+def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
+    """Refuse an arm whose number of springs is not the specification's, before any pressure.
+
+    Returns:
+        Its readings (n_springs,). None where it could not be read: the run then says why.
+
+    Raises:
+        InputError: the number is another; the message begins with `name`.
+    """
+    try:
+        readings = np.array(arm.read_sensors(), float)
+    except Exception:  # a driver may raise anything
+        return None
+    if readings.shape != (spec.n_springs,):
+        raise InputError(
+            f"{name}: got {' x '.join(map(str, readings.shape))} readings, expected {spec.n_springs}, of "
+            f"the {spec.structure.n_sections} sections of {spec.name!r}; {_ANOTHER}?"
+        )
+    return readings
+
+
+def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
+    """Refuse an arm that is not the policy's, before any pressure: by number, range and lengths of springs.
+
+    Raises:
+        InputError: it is another; the message begins with `name`.
+    """
+    # Readings; a run, too, waits LOST_TICKS ticks for them
+    policy, spec = controller.policy, controller.policy.spec
+    length_m = np.full(spec.n_springs, np.nan)
+    for _ in range(LOST_TICKS):
+        readings = check_number(arm, spec, name)
+        if readings is None:
+            return
+        length_m = policy.sensor.lengths(readings, np.nan).length_m
+        if np.isfinite(length_m).any() or not np.isfinite(readings).all():
+            break
+        time.sleep(0.0 if hasattr(arm, "time_s") else controller.dt_s)
+    else:
+        (low, high), unit = policy.sensor.range, policy.sensor.unit
+        raise InputError(
+            f"{name}: got readings of {readings.min():.4g} to {readings.max():.4g} {unit}, expected "
+            f"{low:.4g} to {high:.4g} {unit} as of the policy's arm {spec.name!r}; {_ANOTHER}?"
+        )
+
+    # Mean length without pressure
+    if np.isfinite(length_m).any():
+        got_m = np.nanmean(length_m)
+        asked_m = np.mean(expected_springs(policy.spring_model, np.zeros(spec.n_chambers)))
+        if abs(got_m - asked_m) > _OTHER_LENGTH * spec.length_m / spec.structure.n_sections:
+            raise InputError(
+                f"{name}: got springs of {1e3 * got_m:.0f} mm in the mean without pressure, expected "
+                f"{1e3 * asked_m:.0f} mm as of the policy's arm {spec.name!r}; {_ANOTHER}, or still under "
+                "pressure?"
+            )

@@ -20,27 +20,42 @@ Source: Hairer, Wanner, "Solving Ordinary Differential Equations II", 1996, IV.7
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm import control, pneumatics
+from mjx_softarm._support import xla
 from mjx_softarm._support.lazy import mjx
-from mjx_softarm._support.small_matrices import block_diagonal, products, solve_approximate_gradient
+from mjx_softarm._support.small_matrices import products
+from mjx_softarm.mechanics.chain_hessian import ChainHessian, solve_approximate_gradient
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
 from mjx_softarm.mechanics.motion.state import (
     Motion,
     MotionEnd,
+    MotionParams,
     MovingArm,
     Path,
     friction_damping,
     in_force,
+    loaded,
     pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2, ArmParams
-from mjx_softarm.mechanics.statics import Tendons, all_tendons, chambers_and_springs, joined, statics_of
+from mjx_softarm.mechanics.statics import (
+    Statics,
+    Tendons,
+    all_tendons,
+    chambers_and_springs,
+    joined,
+    statics_of,
+    stretching,
+)
 
 
 def advance(
@@ -51,12 +66,13 @@ def advance(
     duration_s: float,
     period_s: float,
     step_s: float,
+    n_at_once: int | None = None,
 ) -> tuple[Motion, MotionEnd]:
     """Run the arm for a while under the law.
 
-    The gradient ignores the derivatives of each step's matrix and of c. It then takes half the time, and its
-    direction is within 5 degrees of the exact one, 1.5 degrees in the median (64 arms, two actions of half a
-    second).
+    The gradient is by `motion` and `reference_m`; numbers of the arm count as constants. It ignores the
+    derivatives of each step's matrix and of c. It then takes half the time, and its direction is within 5
+    degrees of the exact one, 1.5 degrees in the median (64 arms, two actions of half a second).
 
     Args:
         arm: numbers of the arm.
@@ -66,61 +82,126 @@ def advance(
         duration_s: a whole number of control periods.
         period_s: control period of the model's specification.
         step_s: time step at most; a control period has a whole number of them.
+        n_at_once: arms of a `jax.vmap` that move at once, from `settle.arms_at_once`; None is all of them.
 
     Returns:
         State and observables at the end.
     """
-    # The episode's arm
-    n_steps = math.ceil(period_s / step_s - 1e-9)
-    model = arm.loaded_model()
-    weightless = model.opt.replace(gravity=jnp.zeros(3))  # the weights are in V
-    arm = arm._replace(model=model.replace(opt=weightless))
+    n_ticks, n_steps = round(duration_s / period_s), math.ceil(period_s / step_s - 1e-9)
 
-    def tick(motion: Motion, _):
-        """Run one control period: observe, let the law command pressures, take the time steps."""
-        frames, lines = _at(arm.params, motion.q)
-        _, springs = chambers_and_springs(lines, arm.params)
-        spring_m = springs.length
-        command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
-        motion = motion._replace(law=law)
-        for k in range(n_steps):
-            motion = _step(arm, motion, command, k, period_s / n_steps, period_s)
-        earlier = pushed(motion.earlier_kpa, motion.command_kpa)
-        return motion._replace(command_kpa=command, earlier_kpa=earlier), Path.at(frames, spring_m)
+    def ticks(constants: tuple[control.Gains, ArmParams, MotionParams]) -> Callable[..., tuple[Motion, Path]]:
+        gains, params, own = constants
+        return functools.partial(_tick, arm._replace(params=params, own=own), gains, n_steps, period_s)
 
-    # All control periods, then a last look
-    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        tick = jax.checkpoint(tick, prevent_cse=False)  # a gradient recomputes each tick to save memory
-        end, path = jax.lax.scan(tick, motion, None, length=round(duration_s / period_s))
-        frames, lines = _at(arm.params, end.q)
-        _, springs = chambers_and_springs(lines, arm.params)
-    return end, MotionEnd.of(end, Path.at(frames, springs.length), path)
+    def run(start: tuple[Motion, Array], constants: Any) -> tuple[tuple[Motion, Path, Path], Motion]:
+        """Return state and observables at the end, and the path there; and the state before each period."""
+        motion, reference_m = start
+        tick = ticks(constants)
+
+        def go_on(motion: Motion, _: None) -> tuple[Motion, tuple[Path, Motion]]:
+            after, seen = tick(motion, reference_m)
+            return after, (seen, motion)
+
+        with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+            end, (path, before) = jax.lax.scan(go_on, motion, None, length=n_ticks)
+            return (end, _look(constants[1], end.q), path), before
+
+    def run_back(change: tuple[Motion, Path, Path], states: Any, constants: Any) -> tuple[Motion, Array]:
+        """Return the gradient by state and reference at the start; each period is computed again."""
+        d_end, d_last, d_path = change
+        before, end_q, reference_m = states
+        tick = ticks(constants)
+
+        def go_back(d_after: tuple[Motion, Array], at: tuple[Motion, Path]) -> tuple[Any, None]:
+            motion, d_seen = at
+            d_motion, d_reference = jax.vjp(tick, motion, reference_m)[1]((d_after[0], d_seen))
+            return (d_motion, d_after[1] + d_reference), None
+
+        with jax.default_matmul_precision("highest"):
+            (d_q,) = jax.vjp(functools.partial(_look, constants[1]), end_q)[1](d_last)
+            d_after = d_end._replace(q=d_end.q + d_q), jnp.zeros_like(reference_m)
+            return jax.lax.scan(go_back, d_after, (before, d_path), reverse=True)[0]
+
+    forward, back = (xla.rows_last(function, n_at_once, n_shared=1) for function in (run, run_back))
+    moved = jax.custom_vjp(lambda start, constants: forward(start, constants)[0])
+
+    def forward_and_states(start: tuple[Motion, Array], constants: Any) -> tuple[Any, Any]:
+        found, before = forward(start, constants)
+        return found, ((before, found[0].q, start[1]), constants)
+
+    moved.defvjp(forward_and_states, lambda given, change: (back(change, *given), None))
+    end, last, path = moved((motion, reference_m), (gains, arm.params, arm.own))
+    return end, MotionEnd.of(end, last, path)
+
+
+def _tick(
+    arm: MovingArm, gains: control.Gains, n_steps: int, period_s: float, motion: Motion, reference_m: Array
+) -> tuple[Motion, Path]:
+    """Run one control period: observe, let the law command pressures, take the time steps; arms are last."""
+    seen = _look(arm.params, motion.q)
+
+    # The law takes arms first
+    told: tuple[Any, Any, Any, Any] = reference_m, seen.spring_m, motion.law, gains
+    if reference_m.ndim > 1:
+        told = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), told)
+    command, law = control.pressures(*told, dt_s=period_s)
+    if reference_m.ndim > 1:
+        command, law = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (command, law))
+
+    motion = motion._replace(law=law)
+    for k in range(n_steps):
+        motion = _step(arm, motion, command, k, period_s / n_steps, period_s)
+    earlier = pushed(motion.earlier_kpa, motion.command_kpa)
+    return motion._replace(command_kpa=command, earlier_kpa=earlier), seen
+
+
+def _look(params: ArmParams, q: Array) -> Path:
+    """Return the observables at joint coordinates (nv, *arms)."""
+    lines = _at(params, jax.lax.stop_gradient(q))[1]
+    springs = chambers_and_springs(_sloped(Tendons.changed, lines, q, lines), params)[1]
+    return Path.at(chain_kinematics(params)(q), springs.length)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _sloped(change: Callable, value: Any, x: Any, here: Any) -> Any:
+    """Return a value whose derivative along dx is `change(here, dx)`, whatever it was computed from."""
+    return value
+
+
+_sloped.defjvp(lambda change, primals, tangents: (primals[0], change(primals[2], tangents[1])))
 
 
 @jax.jit  # traced once for its three callers
 def _at(params: ArmParams, q: Array) -> tuple[Frames, Tendons]:
-    """Return the frames at joint coordinates (nv,), and both kinds of tendons as `all_tendons` does."""
+    """Return the frames at joint coordinates (nv, *arms), and both kinds of tendons as `all_tendons` does."""
     frames = chain_kinematics(params)(q)
     return frames, all_tendons(frames, params)
 
 
+@functools.partial(jax.jit, static_argnames=("k", "h", "period_s"))  # traced once for all of its callers
 def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, period_s: float) -> Motion:
-    """Take the k-th step, of length h [s], of a control period with commanded pressures (n_chambers,)."""
+    """Take the k-th step, of length h [s], of a control period; it commands pressures (n_chambers, *arms)."""
     # Middle of the step, as the velocity at its start predicts it
     v, params = motion.velocity, arm.params
-    half_way = 0.5 * h * v  # (nv,)
-    middle = motion._replace(q=motion.q + half_way)
-    frames, lines = _at(params, middle.q)
+    half_way = 0.5 * h * v  # (nv, *arms)
+    q = motion.q + half_way
+    frames, here = _at(params, jax.lax.stop_gradient(q))
+    lines = _sloped(Tendons.changed, here, q, here)
     chambers, _ = chambers_and_springs(lines, params)
+    n_sections, n_chambers, *arms = len(lines.length), *chambers.length.shape
+
+    def rates(jacobian: Array, velocity: Array) -> Array:
+        """Return the rates (n_sections, t, *arms) of tendons at velocities (nv, *arms)."""
+        return products(jacobian, velocity.reshape(n_sections, -1, 1, *arms))[:, :, 0]
 
     def volume_m3(displacement: Array) -> Array:
-        """Return the chambers' volumes (n_chambers,) at joint displacements (nv,) from the middle."""
-        along = products(chambers.jacobian, displacement.reshape(params.n_sections, -1, 1)).reshape(-1)
+        """Return the chambers' volumes (n_chambers, *arms) at displacements (nv, *arms) from the middle."""
+        along = rates(chambers.jacobian, displacement).reshape(n_chambers, *arms)
         area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
         return pneumatics.volume_m3(chambers.length + along, *area, params.free_length_m)
 
     def fill(gas_m3: Array, volume: Array, half: int) -> Array:
-        """Return the gas (n_chambers,) after a half step, counted from the start of the control period."""
+        """Return the gas (n_chambers, *arms) after a half step, counted from the start of the period."""
         line = command_kpa, motion.command_kpa, motion.earlier_kpa
         command = in_force(*line, half, 0.5 * h, arm.own.delay_s, period_s)
         return arm.own.actuators.fill(gas_m3, volume, command, 0.5 * h)
@@ -131,19 +212,22 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     gas_m3 = fill(gas_m3, middle_m3, 2 * k)
     pressure_kpa = pneumatics.pressure_of(gas_m3, middle_m3)
 
-    # Forces in the middle and their derivatives
-    mass, bias = jax.lax.stop_gradient(_inertia(arm, frames, middle))
-    potential = statics_of(lines, frames, middle.q, pressure_kpa, params)
-    damping, stiffness = _dampers(arm, lines.jacobian, v), potential.hessian.dense()
-    # Stiffness of each closed chamber's gas (n_chambers,) [N/m], area^2 dp/dV
-    gas = pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
-    pull = chambers.jacobian * gas.reshape(params.n_sections, -1, 1)
-    stiffness_of_gas = block_diagonal(products(jnp.swapaxes(chambers.jacobian, 1, 2), pull))
+    # Forces in the middle: of the potential, of dampers and of inertia
+    constant = jax.lax.stop_gradient((here, frames, q, pressure_kpa))
+    potential, (mass, bias) = statics_of(*constant, params), inertia(arm, frames, jax.lax.stop_gradient(v))
+    gradient = _sloped(Statics.changed, potential.gradient, (q, pressure_kpa), potential)
+    rate = rates(lines.jacobian, v)
+    damping, of_joints = _dampers(arm, rate)
+    pull = jnp.sum((damping * rate)[:, :, None] * lines.jacobian, axis=1)  # (n_sections, n, *arms)
+    force = gradient + bias + pull.reshape(v.shape) + of_joints * v
 
-    # The linearised midpoint rule
-    force = potential.gradient + bias + damping @ v
-    matrix = mass + 0.5 * h * damping + 0.25 * h**2 * (stiffness + stiffness_of_gas)
-    dv = solve_approximate_gradient(matrix, -h * force[:, None])[:, 0]
+    # The linearised midpoint rule; each closed chamber's gas has a stiffness [N/m], area^2 dp/dV
+    gas = pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
+    of_gas = gas.reshape(n_sections, -1, *arms)
+    slope = (0.5 * h * damping).at[:, : of_gas.shape[1]].add(0.25 * h**2 * of_gas)
+    matrix = mass.plus(potential.hessian, 0.25 * h**2).plus_diagonal(0.5 * h * of_joints)
+    matrix = matrix._replace(own=matrix.own + stretching(slope, lines.jacobian))
+    dv = solve_approximate_gradient(matrix, -h * force.reshape(n_sections, -1, 1, *arms)).reshape(v.shape)
     dq = h * (v + 0.5 * dv)
 
     # Pressures at the end of the step
@@ -154,38 +238,47 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     )
 
 
-def _dampers(arm: MovingArm, jacobian: Array, v: Array) -> Array:
-    """Return the matrix (nv, nv) of dampers and dry friction; the Jacobian is (n_sections, c + s, n)."""
-    # Dampers of chambers and springs
-    n_sections, n_chambers = len(jacobian), len(arm.params.area)
-    of_chambers, of_springs = jnp.split(arm.model.tendon_damping, [n_chambers])
-    damping = joined(of_chambers, of_springs, n_sections)[..., None]
-    own = block_diagonal(products(jnp.swapaxes(jacobian, 1, 2), damping * jacobian))
+def _dampers(arm: MovingArm, rate: Array) -> tuple[Array, Array]:
+    """Return dampers and dry friction of tendons with these rates (n_sections, t, *arms), and of the joints.
 
-    # Dry friction
-    chambers = jacobian[:, : n_chambers // n_sections]
-    rate = products(chambers, v.reshape(n_sections, -1, 1))  # (n_sections, c, 1) [m/s]
-    secant = friction_damping(arm.own.friction_n, rate)
-    friction = block_diagonal(products(jnp.swapaxes(chambers, 1, 2), secant * chambers))
-    return arm.own.damping * (own + jnp.diag(arm.model.dof_damping)) + friction
-
-
-def _inertia(arm: MovingArm, frames: Frames, motion: Motion) -> tuple[Array, Array]:
-    """Return MJX's mass matrix (nv, nv), and its bias (nv,) of the velocities."""
-    # MJX takes the frames of the chain, so it need not run its own kinematics
-    model, params, last = arm.model, arm.params, frames.plate_rotation[-1]
-    tools = frames.plate_position[-1] - params.tool_offset_m[:, None] * last[:, 2]
-    position = jnp.concatenate([jnp.zeros((1, 3)), frames.anchor, tools])  # bodies: world, links, tools
-    rotation = jnp.concatenate([frames.plate_rotation, last[None], last[None]])
-    data = arm.data.replace(
-        qpos=motion.q,
-        qvel=motion.velocity,
-        xpos=position,
-        xmat=rotation,
-        xipos=position,
-        ximat=rotation,
-        xaxis=frames.axis.reshape(-1, 3),
-        xanchor=jnp.repeat(frames.anchor, frames.axis.shape[1], axis=0),
+    Returns:
+        (n_sections, t, *arms) [N s/m] and (nv, *arms).
+    """
+    # Friction is the chambers' alone
+    of_tendons, of_joints = (
+        arm.own.damping * x.reshape(-1, *[1] * (rate.ndim - 2))
+        for x in (arm.model.tendon_damping, arm.model.dof_damping)
     )
-    data = mjx.crb(model, mjx.com_pos(model, data))
-    return mjx.full_m(model, data), mjx.rne(model, mjx.com_vel(model, data)).qfrc_bias
+    n_sections, n_chambers = len(rate), len(arm.params.area)
+    friction = friction_damping(arm.own.friction_n, rate[:, : n_chambers // n_sections])
+    damping = joined(of_tendons[:n_chambers], of_tendons[n_chambers:], n_sections)
+    damping = jnp.broadcast_to(damping, rate.shape)
+    return damping.at[:, : friction.shape[1]].add(friction), of_joints
+
+
+def inertia(arm: MovingArm, frames: Frames, v: Array) -> tuple[ChainHessian, Array]:
+    """Return MJX's mass matrix, and its bias (nv, *arms) of velocities v (nv, *arms)."""
+    params, arms, last = arm.params, v.shape[1:], frames.plate_rotation[-1]
+
+    def of_one(link_kg: Array, tool_kg: Array, v: Array, poses: dict[str, Array]) -> tuple[Array, ...]:
+        """Return the twist of each joint's unit velocity, the momentum that it gives, and the bias."""
+        model = loaded(arm.model, link_kg, tool_kg)
+        model = model.replace(opt=model.opt.replace(gravity=jnp.zeros(3)))  # the weights are in V
+        data = arm.data.replace(qvel=v, xipos=poses["xpos"], ximat=poses["xmat"], **poses)
+        data = mjx.crb(model, mjx.com_pos(model, data))
+        momentum = jax.vmap(mjx._src.math.inert_mul)(data._impl.crb[model.dof_bodyid], data.cdof)
+        return data.cdof, momentum, mjx.rne(model, mjx.com_vel(model, data)).qfrc_bias
+
+    # MJX takes the frames of the chain, so it need not run its own kinematics. Bodies: world, links, tools
+    tools = frames.plate_position[-1] - params.tool_offset_m[:, None] * last[:, 2]
+    poses = {
+        "xpos": jnp.concatenate([jnp.zeros((1, 3, *arms)), frames.anchor, tools]),
+        "xmat": jnp.concatenate([frames.plate_rotation, last[None], last[None]]),
+        "xaxis": frames.axis.reshape(-1, 3, *arms),
+        "xanchor": jnp.repeat(frames.anchor, frames.axis.shape[1], axis=0),
+    }
+    masses = [jnp.broadcast_to(x, (len(x), *arms)) for x in (params.link_mass_kg, params.tool_mass_kg)]
+    each: Any = jax.vmap(of_one, in_axes=-1, out_axes=-1) if arms else of_one
+    *factors, bias = each(*masses, v, poses)
+    twist, momentum = (x.reshape(params.n_sections, -1, 6, *arms) for x in factors)
+    return ChainHessian.of_factors(twist, momentum), bias

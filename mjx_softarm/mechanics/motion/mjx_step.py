@@ -37,6 +37,7 @@ from mjx_softarm.mechanics.motion.state import (
     Path,
     friction_damping,
     in_force,
+    loaded,
     pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2
@@ -113,7 +114,8 @@ def advance(
 
 def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
     """Return the model with time step h [s] and the arm's own masses, stiffnesses and dampers."""
-    model, params = arm.loaded_model(), arm.params
+    params = arm.params
+    model = loaded(arm.model, params.link_mass_kg, params.tool_mass_kg)
     return model.replace(
         tendon_stiffness=jnp.concatenate([params.chamber_stiffness, params.spring_stiffness]),
         tendon_damping=arm.own.damping * model.tendon_damping,

@@ -122,11 +122,12 @@ class MovingArm(NamedTuple):
     params: ArmParams
     own: MotionParams
 
-    def loaded_model(self) -> mjx.Model:
-        """Return the model with the masses of `params`."""
-        mass = jnp.concatenate([jnp.zeros(1), self.params.link_mass_kg, self.params.tool_mass_kg])
-        scale = jnp.where(self.model.body_mass > 0, mass / jnp.maximum(self.model.body_mass, 1e-9), 0.0)
-        return self.model.replace(body_mass=mass, body_inertia=self.model.body_inertia * scale[:, None])
+
+def loaded(model: mjx.Model, link_mass_kg: Array, tool_mass_kg: Array) -> mjx.Model:
+    """Return a model with the masses of `ArmParams`."""
+    mass = jnp.concatenate([jnp.zeros(1), link_mass_kg, tool_mass_kg])
+    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
+    return model.replace(body_mass=mass, body_inertia=model.body_inertia * scale[:, None])
 
 
 def n_earlier(delay_s: float, period_s: float) -> int:
@@ -168,7 +169,7 @@ def in_force(
 
     # Each command is in force from its dead time on; the oldest one was before all others
     line = jnp.concatenate([command_kpa[None], before_kpa[None], earlier_kpa])
-    age_s = period_s * jnp.arange(len(line) - 1, dtype=float)[:, None]
+    age_s = period_s * jnp.arange(len(line) - 1, dtype=float).reshape(-1, *[1] * command_kpa.ndim)
     left_s = jnp.broadcast_to(delay_s, command_kpa.shape)[None] - age_s
     share = jnp.clip(k + 1.0 - left_s / h, 0.0, 1.0)  # (m + 1, n_chambers)
     return line[-1] + jnp.sum(share * (line[:-1] - line[1:]), axis=0)

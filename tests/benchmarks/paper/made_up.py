@@ -14,7 +14,7 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.policy.actor import policy_from_actor
+from mjx_softarm.policy.file import policy_from_actor
 from train.demos.waypoints import task
 
 SPEC = ArmSpec.default()

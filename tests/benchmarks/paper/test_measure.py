@@ -19,8 +19,9 @@ from benchmarks.paper.measure import (
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import Arrival, Ending, LoopRun
+from mjx_softarm.deploy.ending import Ending
 from mjx_softarm.deploy.safety import Event, Fault
+from mjx_softarm.deploy.session import Arrival, LoopRun
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG

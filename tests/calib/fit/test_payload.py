@@ -57,14 +57,14 @@ def poses_with(arm, factor, weight_kg, n, seed):
     true = arm.held._replace(factor=factor, factor_sd=0.0)
     effect_kpa, rng = weight_kg * at.effect_kpa_per_kg, np.random.default_rng(seed)
     kpa = held_kpa(true, at.spring_m, at.pressure_kpa, effect_kpa, rng)
-    kpa = kpa + hysteresis_kpa(arm.spec, arm.held, at.spring_m) + arm.spec.unmodelled_kpa(at.spring_m)
+    kpa = kpa + hysteresis_kpa(arm.spec, arm.held, at.spring_m) + arm.spec.unmodelled_kpa
     m, none = len(kpa), np.empty(0)
     return StaticPoses(kpa, np.full(m, weight_kg), none, none, at.spring_m, none, none, np.ones(m))
 
 
 def told(arm, poses):
     kpa = poses.pressure_kpa - hysteresis_kpa(arm.spec, arm.held, poses.spring_m)
-    return told_payload(arm, poses.spring_m, kpa - arm.spec.unmodelled_kpa(poses.spring_m))
+    return told_payload(arm, poses.spring_m, kpa - arm.spec.unmodelled_kpa)
 
 
 def test_poses_with_a_known_weight_tell_the_factor_of_all_payloads(arm):

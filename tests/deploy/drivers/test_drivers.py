@@ -2,7 +2,6 @@
 
 import os
 import pty
-import socket
 import threading
 import time
 import tty
@@ -14,7 +13,6 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers import serial_line
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.drivers.serial_line import SerialArm
-from mjx_softarm.deploy.drivers.udp import UdpArm
 from mjx_softarm.deploy.record import record
 from tests.arms import SIX_CHAMBERS
 from tests.linear_arm import REST_M, SPEC, LinearArm, N, read_m
@@ -46,7 +44,7 @@ class Controller:
         return [late, f"P {count}\n".encode()]
 
 
-def serve_serial(controller):
+def serve(controller):
     """Return the driver's class and what ends the other end."""
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
@@ -79,36 +77,12 @@ def serve_serial(controller):
     return type("Arm", (SerialArm,), {"port": name, "n": N, "timeout_s": TIMEOUT_S}), end
 
 
-def serve_udp(controller):
-    ours = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    ours.bind(("127.0.0.1", 0))
-
-    def loop():
-        while True:
-            line, sender = ours.recvfrom(4096)
-            if line == b"end":
-                return
-            for answer in controller.answers(line):
-                ours.sendto(answer, sender)
-
-    thread = threading.Thread(target=loop)
-    thread.start()
-
-    def end():
-        ours.sendto(b"end", ours.getsockname())
-        thread.join()
-        ours.close()
-
-    return type("Arm", (UdpArm,), {"address": ours.getsockname(), "n": N, "timeout_s": TIMEOUT_S}), end
-
-
-@pytest.fixture(params=[serve_serial, serve_udp])
+@pytest.fixture
 def line(request):
+    pytest.importorskip("serial")
     controller = Controller()
-    kind, end = request.param(controller)
+    kind, end = serve(controller)
     request.addfinalizer(end)
-    if request.param is serve_serial:
-        pytest.importorskip("serial")
     return kind(), controller
 
 
@@ -153,9 +127,8 @@ def test_what_the_arm_refuses_is_an_error_and_what_it_garbles_is_lost(line):
         with pytest.raises(TimeoutError, match=message):
             arm.read_sensors()
     arm.timeout_s, controller.garbage = TIMEOUT_S, b""
-    if isinstance(arm, SerialArm):
-        with pytest.raises(TimeoutError):  # this answer hangs on to the one without an end
-            arm.read_sensors()
+    with pytest.raises(TimeoutError):  # this answer hangs on to the one without an end
+        arm.read_sensors()
     assert arm.read_sensors().min() > 1e6
 
 
@@ -172,7 +145,7 @@ def test_two_requests_without_an_answer_take_their_timeouts(line):
 def test_board_that_begins_anew_is_waited_for(request, monkeypatch):
     pytest.importorskip("serial")
     controller = Controller()
-    kind, end = serve_serial(controller)
+    kind, end = serve(controller)
     request.addfinalizer(end)
     kind.timeout_s, controller.silent = 0.05, 4
     assert kind().read_sensors().min() > 1e6 and controller.silent == 0
@@ -208,3 +181,33 @@ def test_port_that_is_not_there_is_named():
     pytest.importorskip("serial")
     with pytest.raises(InputError, match="SerialArm: got SerialException: .*ttyACM0.*; expected an arm"):
         open_arm("mjx_softarm.deploy.drivers.serial_line:SerialArm")
+
+
+def test_an_arm_by_its_settings(request, tmp_path):
+    pytest.importorskip("serial")
+    kind, end = serve(Controller())
+    request.addfinalizer(end)
+    file = tmp_path / "wiring.toml"
+    file.write_text(f"[arm]\ndriver = 'serial'\nport = '{kind.port}'\nn = {N}\ntimeout_s = 0.5\n")
+    arm = open_arm(str(file))
+    assert arm.read_sensors().min() > 1e6 and len(arm.pressures()) == N
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[arm", "expected a TOML file"),
+        ("[springs]", "got .*springs.*, expected the table arm"),
+        ("[arm]\ndriver = 'usb'", "got .*'usb'.*, expected the table arm with driver = \"serial\""),
+        (
+            "[arm]\ndriver = 'serial'\nsend = 1",
+            "got send, expected some of port, baud, n, ",
+        ),
+        ("[arm]\ndriver = 'serial'\nport = '/dev/ttyNONE'", "got SerialException: .*/dev/ttyNONE"),
+    ],
+)
+def test_files_that_wire_nothing(text, message, tmp_path):
+    pytest.importorskip("serial")
+    (tmp_path / "wiring.toml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        open_arm(str(tmp_path / "wiring.toml"))

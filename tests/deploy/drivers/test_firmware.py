@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from mjx_softarm.__main__ import main
-from mjx_softarm.deploy.drivers import LineArm
 from mjx_softarm.deploy.drivers.serial_line import SerialArm
 
 FIRMWARE = Path(__file__).resolve().parents[3] / "mjx_softarm/deploy/drivers/firmware/firmware.ino"
@@ -178,7 +177,7 @@ def test_what_the_firmware_refuses(kpa, why, board):
     arm, _ = board
     settled(arm, np.full(9, 8.0))
     with pytest.raises(ValueError, match=f"P: got the refusal '{why}'"):
-        LineArm.write_pressures(arm, kpa)
+        SerialArm.write_pressures(arm, kpa)
     arm.read_sensors()
     np.testing.assert_allclose(arm.pressures(), 8.0, atol=1.5)
 

@@ -6,10 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers import ldc1612
 from mjx_softarm.deploy.drivers.ldc1612 import LdcSprings
-from mjx_softarm.deploy.drivers.names import open_arm
 
 CLOCK_HZ = 40e6
 AT = [(1, 0x2A, 0), (1, 0x2A, 1), (1, 0x2B, 1), (3, 0x2A, 0), (3, 0x2A, 1), (3, 0x2A, 2), (3, 0x2A, 3)]
@@ -175,62 +173,3 @@ def test_another_chip_is_refused(chips):
         LdcSprings(AT)
     with pytest.raises(ValueError, match="drive_current: got 32, expected 0 to 31"):
         LdcSprings(AT, 32)
-
-
-def test_a_file_wires_springs_and_pressures(chips, tmp_path, monkeypatch):
-    from mjx_softarm.deploy.drivers import wiring
-
-    class Regulators:
-        def __init__(self, n):
-            self.kpa = np.zeros(n)
-            self.pressures = lambda: self.kpa
-
-        def write_pressures(self, kpa):
-            self.kpa = kpa
-
-    monkeypatch.setitem(wiring.DRIVERS["pressures"], "cpx-e", Regulators)
-    file = tmp_path / "wiring.toml"
-    file.write_text(f"""
-[springs]
-driver = "ldc1612"
-channels = {[list(at) for at in AT]}
-[pressures]
-driver = "cpx-e"
-n = 9
-""")
-    arm = open_arm(str(file))
-    chips[0].convert()
-    np.testing.assert_allclose(arm.read_sensors()[:2], HZ[:2], atol=0.1)
-    arm.write_pressures(np.arange(9.0))
-    np.testing.assert_array_equal(arm.pressures(), np.arange(9.0))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[arm", "expected a TOML file"),
-        ("", "got nothing, expected the table arm, or springs and pressures"),
-        ("[springs]", "got springs, expected the table arm"),
-        ("[arm]\ndriver = 'usb'", "arm: got .*'usb'.*, expected a table with driver = serial or udp"),
-        (
-            "[arm]\ndriver = 'udp'\nsend = 1",
-            "arm: got TypeError: got send, expected some of address, n, n_spr",
-        ),
-        ("[arm]\ndriver = 'serial'\nport = '/dev/ttyNONE'", "arm: got SerialException: .*/dev/ttyNONE"),
-    ],
-)
-def test_files_that_wire_nothing(text, message, tmp_path):
-    if "serial'" in text:
-        pytest.importorskip("serial")
-    (tmp_path / "wiring.toml").write_text(text)
-    with pytest.raises(InputError, match=message):
-        open_arm(str(tmp_path / "wiring.toml"))
-
-
-def test_a_line_driver_by_its_settings(tmp_path):
-    (tmp_path / "wiring.toml").write_text(
-        "[arm]\ndriver = 'udp'\naddress = ['127.0.0.1', 5005]\nn = 12\nn_springs = 9\n"
-    )
-    arm = open_arm(str(tmp_path / "wiring.toml"))
-    assert (arm.address, arm.n, arm.n_springs) == (("127.0.0.1", 5005), 12, 9) and len(arm.pressures()) == 12
-    arm._socket.close()

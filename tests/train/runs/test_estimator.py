@@ -1,7 +1,5 @@
 """Distillation: held-out errors, payloads, same networks from the same seed, chambers without pressure."""
 
-import functools
-
 import jax
 import mujoco
 import numpy as np
@@ -12,8 +10,7 @@ from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.payload import told_payload
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import TOLERANCE_M, Gains, saturated
-from mjx_softarm.deploy.belief import as_without
-from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.deploy.belief import explained_by_pressure_loss
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
@@ -106,8 +103,7 @@ def arms_at_rest(reference_m, payload_kg, dead):
         pressure_min_kpa=np.where(dead, 0.0, many.pressure_min_kpa).astype(np.float32),
         pressure_max_kpa=np.where(dead, 0.0, many.pressure_max_kpa).astype(np.float32),
     )
-    kinematics = chain_kinematics(params)
-    end = jax.device_get(jax.jit(jax.vmap(functools.partial(settle, kinematics)))(many, reference_m))
+    end = jax.device_get(jax.jit(jax.vmap(settle))(many, reference_m))
     winds = np.where(reference_m > end.spring_m, params.pressure_max_kpa, params.pressure_min_kpa)
     return end, np.where(dead, winds, end.pressure_kpa)
 
@@ -116,7 +112,7 @@ def found(distilled, end, commanded_kpa, reference_m):
     spring_m = end.spring_m + 4e-5 * np.random.default_rng(9).standard_normal(end.spring_m.shape)
     suspect = saturated(commanded_kpa, reference_m, spring_m, Gains.from_spec(SPEC), TOLERANCE_M)
     rows = zip(commanded_kpa, spring_m, strict=True)
-    return suspect & np.array([as_without(distilled.spring_model, *row) for row in rows])
+    return suspect & np.array([explained_by_pressure_loss(distilled.spring_model, *row) for row in rows])
 
 
 @pytest.mark.parametrize("payload_kg", [0.0, 1.0])
@@ -170,13 +166,13 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
     assert found.factor_sd == pytest.approx(0.03)
     loaded = jax.device_get(sample_workspace(SPEC.replace(mass={"payload_kg": 0.45}), N_ARMS, 79))
     for arms, payload_kg in ((others, 0.0), (loaded, 0.5)):
-        kpa = arms.pressure_kpa + hardening(arms.spring_m) + spec.unmodelled_kpa(arms.spring_m)
+        kpa = arms.pressure_kpa + hardening(arms.spring_m) + spec.unmodelled_kpa
         models = distilled.load_estimator, found
         told_kg, half_width_kg = np.array(
             [estimate_load(model, arms.spring_m, kpa) for model in models]
         ).swapaxes(0, 1)
         off_kg = np.abs(told_kg - payload_kg)
         assert np.median(off_kg[1]) < 0.08 and np.median(off_kg[0]) > 1.5 * np.median(off_kg[1])
-        exact_kg, _ = told_payload(arm, arms.spring_m, kpa - spec.unmodelled_kpa(arms.spring_m))
+        exact_kg, _ = told_payload(arm, arms.spring_m, kpa - spec.unmodelled_kpa)
         assert np.sqrt(np.mean((told_kg[1] - exact_kg) ** 2)) < 0.03  # 0.003 after all of the training
         assert np.mean(off_kg[1] < half_width_kg[1]) > 0.9 and np.median(half_width_kg[1]) < 0.3

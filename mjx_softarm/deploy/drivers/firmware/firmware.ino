@@ -1,7 +1,7 @@
 // Reference firmware of an arm: LDC1612 converters read its springs, two valves a chamber hold its pressures.
 //
-// It answers the lines of `mjx_softarm.deploy.drivers` (`python -m pydoc mjx_softarm.deploy.drivers`) and keeps
-// the pressures between them. Without a `P` line for a second it lets all pressures go to zero. It needs a board
+// It answers the lines of `python -m pydoc mjx_softarm.deploy.drivers.serial_line` and keeps the pressures between
+// them. Without a `P` line for a second it lets all pressures go to zero. It needs a board
 // with 3.3 V, some 40 pins and USB, such as a Teensy 4.1; begin with your numbers.
 //
 // Readings of nine springs take some 5 ms on I2C, and a bus that hangs may stop loop(): all valves are closed

@@ -15,8 +15,8 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import Arrival, LoopRun
 from mjx_softarm.deploy.safety import Fault
+from mjx_softarm.deploy.session import Arrival, LoopRun
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
@@ -85,10 +85,10 @@ def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
     chosen = np.zeros(1, int)
     for n_cells in range(1, n + 1):  # along the longest side
         size = (high - low).max() / n_cells + 1e-6
-        at = (workspace[:, :3] - low) / size
-        away = np.linalg.norm(at - np.floor(at) - 0.5, axis=1)
+        cell = (workspace[:, :3] - low) / size
+        away = np.linalg.norm(cell - np.floor(cell) - 0.5, axis=1)
         order = np.argsort(away)
-        _, first = np.unique(np.floor(at[order]), axis=0, return_index=True)
+        _, first = np.unique(np.floor(cell[order]), axis=0, return_index=True)
         if len(first) > n:
             break
         chosen = order[first]
@@ -247,7 +247,7 @@ def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
 
 
 def write_accuracy(
-    folder: Path, accuracy: Accuracy, found: Mapping[str, Any], ways: Sequence[Way] = ()
+    folder: Path, accuracy: Accuracy, numbers: Mapping[str, Any], ways: Sequence[Way] = ()
 ) -> str:
     """Write `accuracy.json` and, with matplotlib, `accuracy.png`; return why there is no picture, or "".
 
@@ -261,8 +261,8 @@ def write_accuracy(
         {"goal": goal.tolist(), "error": error.tolist() if np.isfinite(error).all() else None}
         for goal, error in zip(accuracy.goal, accuracy.error, strict=True)
     ]
-    numbers = {name: None if value != value else value for name, value in found.items()}
-    text = json.dumps({**numbers, "at": points}, indent=2, allow_nan=False)
+    finite = {name: None if value != value else value for name, value in numbers.items()}
+    text = json.dumps({**finite, "at": points}, indent=2, allow_nan=False)
     (folder / "accuracy.json").write_text(f"{text}\n", "utf-8")
 
     # Goals and tips from above and from the side; shares of the goals, or of the time, below an error
@@ -288,3 +288,49 @@ def write_accuracy(
     shares.set(xlabel="translation error [mm]", ylabel=f"share of the {of_what} below", ylim=(0, 1), xlim=0)
     figure.savefig(folder / "accuracy.png", dpi=150)
     return ""
+
+
+def print_run(run: LoopRun, policy: Policy) -> None:
+    """Print faults, times and reached goals of a run, and the reason for a missed goal."""
+    for fault, count in run.counts().items():
+        print(f"fault: {fault.value}: {count} times, {fault.response.value}")
+    if len(run.latency_s):
+        median, high = 1e3 * np.quantile(run.latency_s, (0.5, 0.999))
+        n = len(run.latency_s)
+        print(f"from readings to pressures: median {median:.2f} ms, 99.9 % {high:.2f} ms of {n} ticks")
+    reached = f"{sum(arrival.reached for arrival in run.arrivals)} of {run.n_goals} goals reached"
+    print(f"{reached}; the arm is {'' if run.ending.vented else 'NOT '}vented")
+
+    # The error that a goal allows, and a reason for more
+    if all(arrival.reached for arrival in run.arrivals):
+        return
+    reward = policy.reward
+    for largest, unit, other in (
+        (max(reward.weights[:3]), "mm", "rotation"),
+        (max(reward.weights[3:]), "deg", "position"),
+    ):
+        if largest:
+            within = f"{reward.threshold / largest:.2g} {unit}"
+            print(f"a goal counts as reached within {within} if the {other} is exact")
+    if not policy.calibrated:
+        print(
+            "the policy is not calibrated: it is expected to miss on an arm that differs from its "
+            "specification; record a log, run `python -m calib run`, train and export (docs/your-arm.md)"
+        )
+
+
+def print_figures(numbers: dict[str, Any]) -> None:
+    """Print the figures of an accuracy."""
+    for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
+        mean, high, most = numbers[f"{name}_{unit}"], numbers[f"{name}_95_{unit}"], numbers[most]
+        if np.isnan(mean):  # goals do not ask for it
+            continue
+        print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
+    if "way_s" in numbers:
+        print(
+            f"on the way, {numbers['way_s']:.0f} s [mm]: mean {numbers['way_mm']:.2f}, 95 % below "
+            f"{numbers['way_95_mm']:.2f}, at most {numbers['way_max_mm']:.2f}; "
+            f"{numbers['lag_s']:.2f} s behind, without that {numbers['way_without_lag_mm']:.2f}"
+        )
+    measured = f"{numbers['measured']} of {numbers['points']} goals measured"
+    print(f"{measured}, {numbers['saturated_points']} with a saturated chamber")

@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm.deploy.accuracy.measure import at_rest
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import LoopRun
+from mjx_softarm.deploy.measure import at_rest
+from mjx_softarm.deploy.session import LoopRun
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.pose import pose_error
@@ -32,7 +32,7 @@ AS_CALIBRATED = 1.5  # error of the models over their held-out error, up to whic
 ZERO_M = 1e-3  # prior of the shift of a spring's zero; by hand
 STEP_M = 2e-4  # of the finite differences
 MM_PER_DEG = 0.9  # weight of a turn beside a distance, as for the networks of the pose
-TOLD_MM = 0.4  # shift of a spring's zero that the sentence names
+NAMED_MM = 0.4  # shift of a spring's zero that the sentence names
 MIN_GOALS = 8  # goals that show a change of the arm; `calib run --since` refuses fewer
 # Shift of a zero, and largest part over the error, from which the arm is hardly that of the calibration; by
 # hand. Aged twins have 1.5 mm and 1.0, policies on other twins of the same arm 14 mm.
@@ -85,29 +85,31 @@ _STRANGE = (
 )
 
 
-def _remedies(found: Budget) -> dict[str, str]:
+def _remedies(parts: Budget) -> dict[str, str]:
     """Return cause and remedy of each part, in words."""
-    shifted = np.flatnonzero(np.abs(found.shift_mm) > TOLD_MM)
-    zeros = ", ".join(f"spring{k} {found.shift_mm[k]:+.1f}" for k in shifted) or "all by little"
+    shifted = np.flatnonzero(np.abs(parts.shift_mm) > NAMED_MM)
+    zeros = ", ".join(f"spring{k} {parts.shift_mm[k]:+.1f}" for k in shifted) or "all by little"
     # Remedies of a change; few goals do not show one.
     again = "`python -m calib run LOG --since CALIBRATION` with this log, then `train export --calibration`"
     anew = "record poses anew, and calibrate with them"
-    if found.n_goals < MIN_GOALS:
-        again = anew = f"{found.n_goals} goals do not tell a change from chance: measure {MIN_GOALS} or more"
-    off = f"springs end {found.off_mm:.1f} mm off their references"
+    more = "record more random poses, and calibrate with them"
+    if parts.n_goals < MIN_GOALS:
+        again = f"{parts.n_goals} goals do not show a change beyond chance: measure {MIN_GOALS} or more"
+        anew = again
+    off = f"springs end {parts.off_mm:.1f} mm off their references"
+    payloads = f"the loop believes {parts.believed_g:.0f} g, and --payload says {parts.payload_g:.0f} g"
     return {
         "policy": "its references miss the goals by its own models: train longer, or by the preset analytic",
-        "law": f"{off}, saturated at {found.n_saturated} goals: take goals further inside, or less payload"
-        if found.n_saturated
+        "law": f"{off}, saturated at {parts.n_saturated} goals: take goals further inside, or less payload"
+        if parts.n_saturated
         else f"{off} although no chamber is saturated: look for a leak or a slow regulator",
-        "payload": f"the loop believes {found.believed_g:.0f} g, and --payload says {found.payload_g:.0f} g: "
-        "record the poses of `calib plan`, and calibrate with them",
+        "payload": f"{payloads}: {more}",
         "springs": f"zeros have shifted since the calibration, about [mm]: {zeros}: {again}",
         "estimator": "the distilled pose is off its simulation: only a finer network would help",
-        "S2R": "as large as at the calibration's held-out poses: record the poses of `calib plan`",
+        "S2R": f"as large as at the calibration's held-out poses: {more}",
         # `--since` fits the springs' zeros, which explain the part `springs` alone.
         "rest": "the pose changes as no spring shows, as by hysteresis, or the arm has changed: " + anew
-        if found.calibrated
+        if parts.calibrated
         else "the policy does not know this arm: calibrate it and train (docs/your-arm.md)",
     }
 
@@ -211,17 +213,17 @@ def _shift(
     return shift_m, np.einsum("pnk,n->pk", slope, shift_m)
 
 
-def draw(found: Budget, path: Path) -> None:
+def draw(parts: Budget, path: Path) -> None:
     """Draw the parts as bars, the largest first; needs matplotlib."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     axes = figure.subplots()
-    ordered = sorted(found.parts_mm.items(), key=lambda item: item[1])
+    ordered = sorted(parts.parts_mm.items(), key=lambda item: item[1])
     names, values = [name for name, _ in ordered], [value for _, value in ordered]
-    colours = ["tab:red" if name == found.largest else "tab:blue" for name in names]
+    colours = ["tab:red" if name == parts.largest else "tab:blue" for name in names]
     axes.bar_label(axes.barh(names, values, color=colours), fmt="%.2f", padding=3)
-    axes.set(xlabel=f"part of the mean tip error of {found.total_mm:.2f} mm [mm]")
+    axes.set(xlabel=f"part of the mean tip error of {parts.total_mm:.2f} mm [mm]")
     axes.margins(x=0.12)
     axes.axvline(0.0, color="black", lw=0.8)
     figure.savefig(path, dpi=150)

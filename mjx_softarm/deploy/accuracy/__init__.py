@@ -1,1 +1,0 @@
-"""Accuracy of a policy on an arm, what makes its error, and lines that tell both. NumPy only."""

@@ -1,0 +1,115 @@
+"""Moving goals: the correction of their error, the lead of a policy of motion, the lag of the shape."""
+
+import dataclasses
+from collections import deque
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.moving import ShapeLag, WayError, tip_lag_s
+from mjx_softarm.mdp.observation import RATE_S, TIP_MM_PER_S
+from mjx_softarm.policy.lag import spring_lag_s
+from mjx_softarm.policy.runtime import tip_pose
+from mjx_softarm.sensing.estimator import estimate_frame
+from mjx_softarm.sensing.s2r import inputs
+from tests.linear_arm import DT_S, POLICY, SPEC, SPRINGS_M, N, moves_aside
+from tests.networks import s2r_of
+
+
+@pytest.mark.parametrize("n_lead", [0, 1, 25])
+def test_an_error_that_stays_beside_a_round_way_is_made_up_for(n_lead):
+    """The tip is late, wide and high by constants in the axes of the way, less the correction of its goal."""
+    way, corrected, per_tick, n_ago = WayError(n_lead * DT_S), [], 2 * np.pi / 20.0 * DT_S, max(n_lead, 1)
+    controller = Controller.of(POLICY)
+
+    def axes(k):
+        at = k * per_tick
+        outward = np.array([np.cos(at), np.sin(at), 0.0])
+        return outward, np.array([-np.sin(at), np.cos(at), 0.0]), np.array([0.0, 0.0, 1.0])
+
+    for k in range(1500):
+        now, ahead = (np.append(80.0 * axes(tick)[0], np.zeros(3)) for tick in (k, k + n_lead))
+        late = corrected[-n_ago] if len(corrected) >= n_ago else np.zeros(6)  # the correction is in force
+        outward, along, up = axes(k)
+        off_mm = 3.0 * outward - 4.0 * along + 2.0 * up
+        way = way.advance(ahead, now + np.append(off_mm, np.zeros(3)) + late, controller)
+        corrected.append(way.correction)
+    assert np.linalg.norm(off_mm + late[:3]) < 0.02 * np.linalg.norm(off_mm)
+    assert not corrected[n_lead].any() and not way.correction[3:].any()
+
+
+@pytest.mark.parametrize("load_kg", [0.0, 1.0])
+@pytest.mark.parametrize("corrected", [False, True])
+def test_the_shape_lags_by_the_time_constant_of_the_backbone_and_is_at_rest_with_the_springs(
+    load_kg, corrected
+):
+    """The payload doubles what lags; a sim-to-real network that turns with the springs does not lag."""
+    policy = moves_aside(POLICY)
+    if corrected:
+        straight_m = np.full(N, SPEC.geometry.section_length_m, np.float32)
+        n_in = len(inputs(estimate_frame(policy.estimator, straight_m, 0.0), straight_m))
+        layers = ((np.full((n_in, 6), 0.1, np.float32), np.zeros(6, np.float32)),)
+        policy = dataclasses.replace(policy, s2r=s2r_of(layers, 0.1))
+    lag_s, rate_m_per_s = SPEC.shape_lag_s, 5e-3 * (np.arange(N) == N - 1)
+    start_m = np.full(N, SPEC.geometry.section_length_m)  # the straight arm, whose plates are level
+    shape, behind = ShapeLag().advance(policy, start_m, load_kg, DT_S)
+    assert not behind.any()
+    for k in range(1, round(8.0 * lag_s / DT_S)):
+        spring_m = start_m + k * DT_S * rate_m_per_s
+        shape, behind = shape.advance(policy, spring_m, load_kg, DT_S)
+    expected_mm = 2.5 * (1.0 + load_kg) * lag_s  # 5 mm/s of the spring
+    np.testing.assert_allclose(behind, [expected_mm, 0.0, 0.0, 0.0, 0.0, 0.0], rtol=1e-3, atol=2e-3)
+    for _ in range(round(12.0 * lag_s / DT_S)):
+        shape, behind = shape.advance(policy, spring_m, load_kg, DT_S)
+    np.testing.assert_allclose(behind, 0.0, atol=1e-3)
+
+
+# Chambers of a section lengthen all its springs alike, so that the tip moves up and down
+_GAIN = np.kron(np.eye(SPEC.structure.n_sections), np.full((3, 3), 3e-4)).astype(np.float32)
+_SPRINGS = POLICY.spring_model._replace(layers=((_GAIN, np.zeros(N, np.float32)),))
+OF_MOTION = dataclasses.replace(POLICY, spring_model=_SPRINGS, action_s=0.3)
+
+
+def high(pose, goal, spring_m, sensed):
+    """Springs of the straight arm at the goal's height."""
+    return np.full(N, -1e-3 * goal[2] / 3)
+
+
+@pytest.mark.parametrize("slower", [1.0, 2.0])
+def test_the_tip_lags_by_the_law(slower):
+    """By the time in which a reference is approached, the lag of the springs and a tick."""
+    gains = OF_MOTION.gains._replace(ki_kpa_per_ms=OF_MOTION.gains.ki_kpa_per_ms / slower)
+    policy = dataclasses.replace(OF_MOTION, gains=gains)
+    law_s = np.mean(spring_lag_s(policy, np.zeros(N)) @ np.ones(N))
+    lag_s = tip_lag_s(Controller.of(policy, high))
+    assert lag_s == pytest.approx(SPEC.control.reference_s + law_s + DT_S, rel=0.1)
+
+
+def test_what_a_plan_waits_is_part_of_the_lag():
+    kept = deque(maxlen=11)
+
+    def late(pose, goal, spring_m, sensed):
+        kept.append(goal)
+        return high(pose, kept[0], spring_m, sensed)
+
+    assert tip_lag_s(Controller.of(OF_MOTION, late)) - tip_lag_s(
+        Controller.of(OF_MOTION, high)
+    ) == pytest.approx(10 * DT_S, abs=1e-3)
+
+
+def test_the_rehearsal_tells_the_policy_of_motion_what_the_loop_tells_it():
+    """The tip's velocity is that of poses at rest; the pose itself lags."""
+    told = []
+
+    def noting(pose, goal, spring_m, sensed):
+        told.append((pose, tip_pose(policy, spring_m, 0.0)[0], sensed))
+        return SPRINGS_M[len(told) // 10 % 2]  # moves on, sometimes
+
+    policy = moves_aside(dataclasses.replace(POLICY, observation="motion", action_s=0.3))
+    tip_lag_s(Controller.of(policy, noting))
+    poses, at_rest, sensed = map(np.array, zip(*told[:200], strict=True))
+    moved_mm = at_rest[50:, :3] - at_rest[45:-5, :3]
+    velocity = slice(2 * N, 2 * N + 3)
+    np.testing.assert_allclose(sensed[50:, velocity] * TIP_MM_PER_S * RATE_S, moved_mm, atol=0.05)
+    assert np.abs(poses - at_rest).max() > 1.0

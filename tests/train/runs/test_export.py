@@ -1,0 +1,102 @@
+"""The actor alone in a file: the page's NumPy runs it, and its scales are those of training."""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calib.arm import CalibratedArm
+from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm.mdp.observation import (
+    ObsScale,
+    layouts,
+    observe,
+    observe_motion,
+    observe_payload,
+    rate_ticks,
+)
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.policy.file import SHIPPED, load_policy
+from tests.train.small import CONFIG, SHORT
+from train.__main__ import main
+from train.agent.networks import Actor, mode
+from train.runs.export import contents, observation_scaling
+from train.runs.folder import Run
+
+ROOT = Path(__file__).resolve().parents[3]
+BLOCK = re.search(r"```python\n(.+?)```", (ROOT / "docs/export.md").read_text("utf-8"), re.S)[1]
+SPEC, RNG = SHORT, np.random.default_rng(0)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run whose actor has random weights."""
+    run = Run.create(tmp_path / "run", CONFIG, CalibratedArm(SPEC))
+    params = Actor(SPEC.n_springs, CONFIG.learner.hidden).init(jax.random.key(3), jnp.zeros(18))
+    run.checkpoints.save(1, {"any": np.zeros(1)}, {"policy": params})
+    return run
+
+
+def test_the_page_s_numpy_gives_the_actions_of_training(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(run.path), "--weights", "actor.npz"]) == 0
+    assert len(BLOCK.splitlines()) == 12
+    values = {}
+    exec(BLOCK, values)
+    obs = observe(
+        *(jnp.float32(values[name]) for name in ("pose", "goal")), ObsScale.from_spec(SPEC), RewardConfig()
+    )
+    action = mode(*Actor(SPEC.n_springs, CONFIG.learner.hidden).apply(run.policy(), obs)[:1])
+    assert np.abs(action).max() > 0.05
+    expected = ActionMap.from_spec(SPEC).readings(np.asarray(action, np.float64))
+    np.testing.assert_allclose(values["readings"], expected, rtol=1e-6)
+
+
+def random_entries(kind):
+    """Return entries of an observation as `layouts` names them, and the observation of training."""
+    pose, goal = (RNG.uniform(-170.0, 170.0, 6) for _ in range(2))
+    reward = RewardConfig(axes=(1.0, 1.0, 1.0, 0.0, 1.0, 1.0))
+    raw, obs = [pose, goal, pose - goal], [observe(pose, goal, ObsScale.from_spec(SPEC), reward)]
+    if kind == "payload":
+        raw.append(np.array([0.3]))
+        obs.append(observe_payload(0.3, SPEC))
+    if kind == "motion":
+        n, c, rate_hz = SPEC.n_springs, SPEC.n_chambers, SPEC.control.rate_hz
+        over_s = rate_ticks(rate_hz) / rate_hz
+        spring, rate, tip, velocity, integral, action = map(RNG.standard_normal, (n, n, 3, 3, c, n))
+        raw += [spring, rate, velocity, integral, action]
+        moves = spring, spring - over_s * rate, tip, tip - over_s * velocity
+        obs.append(observe_motion(*moves, integral, action, SPEC))
+    return reward, np.concatenate(raw), np.concatenate(obs)
+
+
+@pytest.mark.parametrize("kind", ["pose", "payload", "motion"])
+def test_scales_are_those_of_training(kind):
+    reward, raw, expected = random_entries(kind)
+    centre, scale = observation_scaling(SPEC, reward, kind)
+    away = raw - centre
+    away[[3, 4, 5, 9, 10, 11, 15, 16, 17]] = (away[[3, 4, 5, 9, 10, 11, 15, 16, 17]] + 180) % 360 - 180
+    assert len(centre) == len(layouts(SPEC)[kind])
+    np.testing.assert_allclose(away / scale, expected, rtol=2e-6, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "message"),
+    [
+        ({"params": {"other": {}}}, [], "actor parameters: got ['other'], expected hidden_0"),
+        (None, ["--onnx"], "--weights: got --onnx too, expected it alone"),
+        (None, ["absent"], "RUN: got 2, expected one folder of a run"),
+    ],
+)
+def test_what_the_file_cannot_hold_is_refused(policy, options, message, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Run, "policy", lambda run, own=Run.policy: policy or own(run))
+    assert main(["export", str(run.path), *options, "--weights", str(tmp_path / "actor.npz")]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "actor.npz").exists()
+
+
+def test_the_contents_of_a_policy_are_named():
+    lines = "\n".join(contents(load_policy(SHIPPED)))
+    assert "18-192-192-192-192-9, swish" in lines and "tip 0.56 mm" in lines and "2,048 poses" in lines
