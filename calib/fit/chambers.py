@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import N_KINDS, Measured, error_groups, simulate, tip_changes
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal, refine
@@ -29,6 +28,7 @@ from calib.fit.parameters import by_name, half_widths, names, priors, spec_at, t
 from calib.fit.pose_errors import PoseErrors, errors_of
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.spec import ArmSpec
 
 MIN_POSES = 20
@@ -38,7 +38,7 @@ HELD_OUT_BLOCK = 5  # poses
 SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # first guess for tip [m], rotation [rad], springs [m] and markers [m]
 MIN_SCALE = (1e-4, 1e-3, 1e-4, 1e-4)  # least values of the same scales
 MAX_RATIO = 2.0  # warn from this ratio of calibrated to specified values, or of held-out to other errors
-TOLD_TURN_DEG = 1.0  # turn of the measured tip from which a note tells it
+NOTED_TURN_DEG = 1.0  # turn of the measured tip from which there is a note
 MAX_PRESSURE_GAP = 0.1  # share of the pressure range that may be missing at either end
 
 
@@ -81,7 +81,7 @@ class ChamberFit:
     def notes(self) -> tuple[str, ...]:
         """Say whether motion capture's axes of the tip differ from the axes of the last plate."""
         turn_deg = np.linalg.norm(self.spec.mounting.tip_turn_deg)
-        if turn_deg < TOLD_TURN_DEG:
+        if turn_deg < NOTED_TURN_DEG:
             return ()
         return (
             f"the tip's measured quaternion is {turn_deg:.1f} deg off with the arm straight. The "
@@ -156,7 +156,7 @@ def _section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[
     """Return the markers at the sections' ends, NaN where they are not to be used, and why not."""
     try:
         return section_ends(poses, spec), ()
-    except FitError as error:  # the fit goes without them
+    except InputError as error:  # the fit goes without them
         return np.full((poses.n, spec.structure.n_sections, 3), np.nan), (str(error),)
 
 

@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.errors import FitError
 from calib.read.static_poses import StaticPoses
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.posture import posture
 from mjx_softarm.spec import ArmSpec
@@ -50,16 +50,16 @@ def section_ends(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
     """Return the markers on the sections' last plates (n, n_sections, 3) [m], NaN where not measured.
 
     Raises:
-        FitError: the sections have unequal numbers, no pose has all, or the last is off the tip's plate.
+        InputError: the sections have unequal numbers, no pose has all, or the last is off the tip's plate.
     """
     n_markers, n_sections = poses.marker_m.shape[1], spec.structure.n_sections
     if n_markers == 0:
         return np.full((poses.n, n_sections, 3), np.nan)
     if n_markers % n_sections:
-        raise FitError(f"markers: got {n_markers}, expected as many in each of {n_sections} sections")
+        raise InputError(f"markers: got {n_markers}, expected as many in each of {n_sections} sections")
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
     if len(seen) == 0:
-        raise FitError("markers: got no pose at rest that has them, expected one or more")
+        raise InputError("markers: got no pose at rest that has them, expected one or more")
     _marker_site(poses.take(seen))
     step = n_markers // n_sections
     return poses.marker_m[:, step - 1 :: step]
@@ -74,7 +74,7 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
         spec: the arm.
 
     Raises:
-        FitError: the last is off the tip's plate.
+        InputError: the last is off the tip's plate.
     """
     # Choose the most bent poses.
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
@@ -173,7 +173,7 @@ def _marker_site(poses: StaticPoses) -> np.ndarray:
     seen = np.einsum("nij,ni->nj", poses.tip_rotation, poses.marker_m[:, -1] - poses.tip_m)
     site_m = np.median(seen, axis=0)
     if abs(site_m[2]) > MAX_OFF_PLATE_M:
-        raise FitError(
+        raise InputError(
             f"markers: got the last {1e3 * site_m[2]:+.1f} mm above the tip's plate, expected it in the "
             f"plate within {1e3 * MAX_OFF_PLATE_M:.0f} mm: number the markers from base to tip"
         )

@@ -3,7 +3,7 @@
 Each spring has a robust line, or all have one; see `calib.fit.lines`.
 
 Of a coil, L = beta K w / (1 - I_comp w) + delta with w = C (2 pi f)^2. This stays the same when C grows by a
-factor and beta and I_comp shrink by it, so C keeps its given value. The curvature of L against f^2 tells
+factor and beta and I_comp shrink by it, so C keeps its given value. The curvature of L against f^2 shows
 I_comp, one for all springs, if the lengths reach far enough.
 """
 
@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.errors import FitError
 from calib.fit.lines import fit_line
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.sensing.sensors import Coil, Sensor
 
 
@@ -54,8 +54,8 @@ def fit_springs(
         seed: seed that chooses which blocks of rows are held out together.
 
     Raises:
-        FitError: the shapes differ, a spring has fewer than 3 rows or one reading only, or a compensation is
-            to be fitted to sensors that have none.
+        InputError: the shapes differ, a spring has fewer than 3 rows or one reading only, or the sensors have
+            no compensation to fit.
     """
     readings = np.asarray(readings, float)
     low, high = sensor.range
@@ -64,7 +64,7 @@ def fit_springs(
     # Lengths are straight in raw lengths; with a compensation in w / (1 - I_comp w), the largest w being 1.
     if fit_compensation:
         if not isinstance(sensor, Coil):
-            raise FitError(f"fit_compensation: got sensors of kind {sensor.kind}, expected {Coil.kind}")
+            raise InputError(f"fit_compensation: got sensors of kind {sensor.kind}, expected {Coil.kind}")
         inverse_h = np.where(believed, sensor.inverse_inductance(readings), np.nan)
         unit_h = 1.0 / np.nanmax(inverse_h)  # I_comp beyond it would leave no coil
         x, scale, share = inverse_h * unit_h, unit_h / sensor.coil_hm, sensor.compensation_h / unit_h

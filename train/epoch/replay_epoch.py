@@ -217,7 +217,7 @@ class ReplayEpoch:
         memory = replay.add(state.memory, experience, valid)
 
         # Learn.
-        learner, losses = self._learn(state.learner, memory, key_updates, warmed_up)
+        learner, losses = self.learn(state.learner, memory, key_updates, warmed_up)
         ended = outcome.terminated | outcome.truncated
         of_arms = after.metrics | {"episodes": ended, "successes": ended & (after.metrics["reached"] > 0)}
         env_metrics = {f"env/{name}": jnp.mean(value) for name, value in of_arms.items()}
@@ -233,7 +233,7 @@ class ReplayEpoch:
         epochs, steps = divmod(self.config.n_warmup_vector_steps, self.config.vector_steps_per_epoch)
         return (n_epochs > epochs) | ((n_epochs == epochs) & (step >= steps))
 
-    def _learn(
+    def learn(
         self, learner: Any, memory: replay.Ring, key: Array, warmed_up: Array
     ) -> tuple[Any, dict[str, Array]]:
         """Take the updates of one vector step, none before the end of warm-up.

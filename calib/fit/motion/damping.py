@@ -18,10 +18,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
-from calib.fit.motion.parts import clusters, dense_parts
+from calib.fit.motion.tracks import clusters, dense_parts
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import PerSection, scaled
 from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
@@ -80,11 +80,11 @@ def fit_damping(
         bending_prior: standard deviation of the logarithm of the backbone's damping.
 
     Raises:
-        FitError: the specified damping is zero.
+        InputError: the specified damping is zero.
     """
     both = spec.chambers.damping_ns_per_m, spec.backbone.bending_damping_nms_per_rad
     if not all(np.all(np.greater(damping, 0.0)) for damping in both):
-        raise FitError(
+        raise InputError(
             f"damping: got chambers.damping_ns_per_m {both[0]!r} and "
             f"backbone.bending_damping_nms_per_rad {both[1]!r}, "
             "expected both above 0"
