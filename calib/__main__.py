@@ -14,7 +14,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -90,21 +90,23 @@ def _run(
     since: cli.MaybePath = None,
     shared_springs: bool = False,
     fit_compensation: bool = False,
+    s2r: Literal["process", "printed"] = "process",
     seed: int = 0,
 ) -> int:
     """Calibrate springs, chambers, damping and the sim-to-real network; logs of `deploy` show later changes.
 
     Args:
         out: folder to write
-        since: calibration that goes on: the logs are later ones, and tell what has changed and how payloads
+        since: calibration that goes on: the logs are later ones, and show what has changed and how payloads
             are felt, nothing else
         shared_springs: fit one beta and one delta for all springs
         fit_compensation: fit the circuit's compensation inductance, too
+        s2r: sim-to-real network: ours, which learns a Gaussian process, or the paper's as printed
         seed: seed of all random draws
     """
+    from calib import steps
     from calib.report.page import warning_lines
     from calib.run import calibrate, go_on, load_calibration, refuse_existing, write_calibration
-    from calib.steps import STEPS, springs
     from mjx_softarm._support import xla
     from mjx_softarm._support.provenance import provenance
 
@@ -113,25 +115,37 @@ def _run(
     refuse_existing(out)
     if since and spec:
         raise InputError(f"--spec: got {spec} and --since {since}, which has its own, expected one")
-    how = {"shared": shared_springs, "fit_compensation": fit_compensation}
-    if since and any(how.values()):
-        option = "--shared-springs" if shared_springs else "--fit-compensation"
-        raise InputError(f"{option}: got --since {since}, whose springs' lines stay, expected one of them")
+    options = {
+        "--shared-springs": shared_springs,
+        "--fit-compensation": fit_compensation,
+        "--s2r": s2r != "process",
+    }
+    for option, given in options.items():
+        if since and given:
+            raise InputError(
+                f"{option}: got --since {since}, whose springs and S2R stay, expected one of them"
+            )
     known = load_calibration(since) if since else None
-    arm = known.spec if known else ArmSpec.of(spec)
+    arm = known.arm.spec if known else ArmSpec.of(spec)
     if not (spec or since):
         print(f"arm: {arm.name}, by default; --spec names another arm")
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
-    steps = {**STEPS, "springs": functools.partial(springs, **how)}
-    tell = functools.partial(print, flush=True)
-    calibration = go_on(known, read, seed, tell) if known else calibrate(read, arm, seed, steps, tell)
+    chosen = dict(steps.STEPS)
+    chosen["springs"] = functools.partial(
+        steps.springs, shared=shared_springs, fit_compensation=fit_compensation
+    )
+    chosen["sim-to-real network"] = functools.partial(steps.s2r, printed=s2r == "printed")
+    progress = functools.partial(print, flush=True)
+    calibration = (
+        go_on(known, read, seed, progress) if known else calibrate(read, arm, seed, chosen, progress)
+    )
     # Write the folder, and print the reasons not to trust it.
     write_calibration(out, calibration, [str(finding) for finding in findings], provenance("calib"))
     lines = warning_lines(calibration.sections)
     lines += [f"note: {section.title}: {note}" for section in calibration.sections for note in section.notes]
     print("\n".join([*lines, f"report: {out / 'report.html'}"]))
-    if known and calibration.spec == known.spec and calibration.held is known.held:
+    if known and calibration.arm.spec == known.arm.spec and calibration.arm.held is known.arm.held:
         print(f"next: nothing to export; {since} stays the calibration of this arm")
     else:
         after = "train export RUN" if since else "train reach --preset analytic"

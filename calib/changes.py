@@ -4,7 +4,7 @@ The calibrated simulation settles at the lengths that the springs read at later 
 S2R corrects its tip. Where zeros have shifted, the measured tip lies elsewhere, and other pressures hold the
 arm. Where chambers are softer, less pressure holds it. Robust least squares with a prior fit both to both
 (`calib.fit.leastsquares`), beside offsets of the pressures, since a calibration does not know these exactly.
-Poses of one circle are alike, so softer chambers are told from offsets to some per cent only. The fitted
+Poses of one circle are alike, so softer chambers differ from offsets to some per cent only. The fitted
 pressures are those of the later poses in either case, and with them the estimate of payloads there.
 
 Some poses take no part in a first fit and judge it. Changes that do not bring their tips closer, or their
@@ -20,12 +20,13 @@ import numpy as np
 from calib.arm import CalibratedArm
 from calib.fit.blocks import held_out_blocks
 from calib.fit.held_pressures import without_redundant_part
-from calib.fit.leastsquares import QUANTILE, Problem, Solution, fit, rms_of
+from calib.fit.leastsquares import Problem, Solution, fit, rms_of
 from calib.fit.pose_errors import PoseErrors, change_errors
 from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.sensing.held_pressures import held_kpa
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import correct, correction_between
 from mjx_softarm.spec import ArmSpec

@@ -12,7 +12,6 @@ The result is a folder that training takes:
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,32 +19,23 @@ from pathlib import Path
 from typing import Any
 
 from calib.arm import CalibratedArm
-from calib.read.measurements import measure
+from calib.read.measurements import Measurements, measure
 from calib.read.static_poses import SAME_KG
 from calib.report.page import Section, to_html, to_json
-from calib.steps import STEPS, Extras, Step, changes, payloads
+from calib.steps import STEPS, Step, changes, payloads
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.sensing.held_pressures import HeldPressures
-from mjx_softarm.sensing.s2r import S2R
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated arm, the sections of the report, and what training and the view need."""
+    """Calibrated arm, the sections of the report, and the poses that the view shows."""
 
-    spec: ArmSpec
+    arm: CalibratedArm
     sections: tuple[Section, ...]
-    s2r: S2R | None  # None where it was not fitted, or is no better than the simulation
-    held: HeldPressures | None  # None where they were not fitted, or are no better than the simulation
     pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
-
-    @property
-    def arm(self) -> CalibratedArm:
-        """The arm as training takes it."""
-        return CalibratedArm(self.spec, self.s2r, self.held)
 
 
 def calibrate(
@@ -74,14 +64,8 @@ def calibrate(
     if 0 < len(later) < len(logs):
         first = calibrate([log for log in logs if log.goal is None], spec, seed, steps, progress)
         return go_on(first, later, seed, progress)
-    measurements = measure(logs, spec)
-    report, extras = [], Extras()
-    for name, step in steps.items():
-        progress(f"{name} ...")
-        spec, section, found = step(measurements, spec, seed)
-        report.append(section)
-        extras |= found
-    return Calibration(spec, tuple(report), extras.get("s2r"), extras.get("held"), extras.get("pairs", {}))
+    start = Calibration(CalibratedArm(spec), (), {})
+    return _run_steps(start, steps, measure(logs, spec), seed, progress)
 
 
 def go_on(
@@ -92,21 +76,34 @@ def go_on(
 ) -> Calibration:
     """Return a calibration that goes on with later logs; arguments as of `calibrate`.
 
-    Poses without a payload tell what has changed, poses with a known weight how strongly payloads are felt.
+    Poses without a payload show what has changed, poses with a known weight how strongly payloads are felt.
 
     Raises:
         LogError: the logs are of different arms.
     """
-    measurements = measure(later, since.spec, needed=("pressure_kpa",))
-    loaded = measurements.poses.payload_kg > since.spec.mass.payload_kg + SAME_KG
-    steps = {} if len(loaded) and loaded.all() else {"changes": changes}
+    spec = since.arm.spec
+    measurements = measure(later, spec, needed=("pressure_kpa",))
+    loaded = measurements.poses.payload_kg > spec.mass.payload_kg + SAME_KG
+    steps: dict[str, Step] = {} if len(loaded) and loaded.all() else {"changes": changes}
     steps |= {"payloads": payloads} if loaded.any() else {}
+    return _run_steps(since, steps, measurements, seed, progress)
+
+
+def _run_steps(
+    calibration: Calibration,
+    steps: Mapping[str, Step],
+    measurements: Measurements,
+    seed: int,
+    progress: Callable[[str], None],
+) -> Calibration:
+    """Return a calibration after further steps; each begins with the arm of the step before."""
     for name, step in steps.items():
         progress(f"{name} ...")
-        spec, section, found = step(measurements, since.arm, seed)
-        held = found.get("held", since.held)
-        since = dataclasses.replace(since, spec=spec, held=held, sections=(*since.sections, section))
-    return since
+        result = step(measurements, calibration.arm, seed)
+        calibration = Calibration(
+            result.arm, (*calibration.sections, result.section), result.pairs or calibration.pairs
+        )
+    return calibration
 
 
 def load_calibration(folder: Path) -> Calibration:
@@ -115,9 +112,8 @@ def load_calibration(folder: Path) -> Calibration:
     Raises:
         InputError: a file is missing, damaged, or of another arm.
     """
-    spec, s2r, held = CalibratedArm.read(folder)
     pairs = read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {}
-    return Calibration(spec, (), s2r, held, pairs)
+    return Calibration(CalibratedArm.read(folder), (), pairs)
 
 
 def refuse_existing(folder: Path) -> None:
@@ -151,13 +147,13 @@ def write_calibration(
     try:
         # Write a folder beside it, then rename that.
         part.mkdir(parents=True)
-        calibration.spec.to_toml(part / ARM_FILE)
+        calibration.arm.spec.to_toml(part / ARM_FILE)
         calibration.arm.write_models(part)
         if calibration.pairs:
             write_pose_pairs(part, calibration.pairs)
         report = (calibration.sections, findings, provenance)
         write_json(part / "report.json", to_json(*report))
-        (part / "report.html").write_text(to_html(calibration.spec.name, *report), "utf-8")
+        (part / "report.html").write_text(to_html(calibration.arm.spec.name, *report), "utf-8")
         part.replace(folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)

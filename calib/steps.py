@@ -1,4 +1,4 @@
-"""Steps of a calibration: each turns measurements and a specification into a better one and a section.
+"""Steps of a calibration: each turns measurements and an arm into a better arm and a section of the report.
 
 A step without data, or whose fit is worse on held-out data than its start, keeps the specification's values,
 and warns.
@@ -9,13 +9,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib.arm import CalibratedArm
 from calib.changes import MIN_POSES as MIN_LATER
 from calib.changes import fit_changes
+from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
@@ -23,53 +24,52 @@ from calib.fit.motion.actuators import fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
-from calib.fit.payload import LEAST_WEIGHT, MIN_WEIGHED, held_at, payload_poses, told_widths, weighed
-from calib.fit.s2r import fit_s2r, simulate_poses
+from calib.fit.payload import (
+    LEAST_WEIGHT,
+    MIN_WEIGHED,
+    fit_payload_scale,
+    held_at,
+    payload_intervals,
+    payload_poses,
+)
+from calib.fit.pose_errors import PoseErrors, pose_errors
+from calib.fit.s2r import SimulatedPoses, fit_printed, fit_s2r, moved, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
-from calib.report import motion, sections
-from calib.report.changes import CHANGES, PAYLOADS, changes_section, payloads_section
+from calib.report import sections
 from calib.report.page import Section
 from mjx_softarm.logs.pose_pairs import PosePairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
-from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.sensing.load import KNOWN
 from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, correct, extrapolation
+from mjx_softarm.sensing.s2r import correct, extrapolation
 from mjx_softarm.spec import ArmSpec, Unmodelled
 
 MIN_S2R_POSES = 60
 NOT_FITTED = "Not fitted: the specification's values stay."
 
 
-class Extras(TypedDict, total=False):
-    """Results beside the specification. A step adds some; a later step may replace them."""
-
-    s2r: S2R
-    held: HeldPressures  # residual pressures of the unloaded arm
-    pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
-
-
 class StepResult(NamedTuple):
     """Result of a step."""
 
-    spec: ArmSpec  # arm with the numbers that the step fitted
+    arm: CalibratedArm  # with the numbers and models that the step fitted
     section: Section  # section of the report
-    extras: Extras = Extras()
+    pairs: Mapping[str, PosePairs] | None = None  # measured and simulated poses, without and with the network
 
 
-Step = Callable[[Measurements, ArmSpec, int], StepResult]
+Step = Callable[[Measurements, CalibratedArm, int], StepResult]
 
 
 def springs(
     measurements: Measurements,
-    spec: ArmSpec,
+    arm: CalibratedArm,
     seed: int,
     shared: bool = False,
     fit_compensation: bool = False,
 ) -> StepResult:
     """Fit beta and delta of the springs' sensors; options as in `calib.fit.sensors.fit_springs`."""
+    spec = arm.spec
     pairs = [
         (readings, log.spring_m)
         for log in measurements.logs
@@ -78,7 +78,7 @@ def springs(
     if not pairs:
         needed = f"{NOT_FITTED} No log has both readings and measured spring lengths."
         remedy = "beta and delta are not this arm's: log readings beside spring lengths on a ruler"
-        return StepResult(spec, Section("Springs", needed, warnings=(remedy,)))
+        return StepResult(arm, Section("Springs", needed, warnings=(remedy,)))
     readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
     fit = fit_springs(readings, length_m, spec.spring_sensor, fit_compensation, shared, seed=seed)
     # Put the fitted numbers into the specification, and show the residuals.
@@ -87,86 +87,132 @@ def springs(
         sensor["compensation_h"] = fit.compensation_h
     spec = spec.replace(sensor=sensor)
     calibrated = spec.spring_sensor.lengths(readings, np.nan)
-    return StepResult(spec, sections.springs(fit, calibrated.length_m, length_m, spec.springs_per_section))
+    section = sections.springs(fit, calibrated.length_m, length_m, spec.springs_per_section)
+    return StepResult(arm._replace(spec=spec), section)
 
 
-def chambers(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
+def chambers(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
     """Fit stiffness, area and length of the chambers, the backbone and the mounting to poses at rest."""
     n = measurements.poses.n
     if n < MIN_POSES:
         needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', n, measurements.row_uses)}"
         remedy = f"stiffness, area and length are not this arm's: log {MIN_POSES} poses at rest or more"
-        return StepResult(spec, Section("Chambers", needed, warnings=(remedy,)))
-    fit = fit_chambers(measurements, spec, seed)
+        return StepResult(arm, Section("Chambers", needed, warnings=(remedy,)))
+    fit = fit_chambers(measurements, arm.spec, seed)
     section = sections.chambers(fit)
     # Check the chambers' lengths by markers along the arm.
     if fit.has_markers and fit.poses.marker_m.shape[1] >= MIN_MARKERS:
         section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
-    return StepResult(fit.spec if fit.is_better else spec, section)
+    return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, section)
 
 
-def actuators(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
+def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
     """Fit pumps or regulators to commanded and measured pressures."""
-    tracks = find_tracks(measurements.logs, spec)
+    tracks = find_tracks(measurements.logs, arm.spec)
     if not tracks:
         needed = "No log has commanded and measured pressures at the control rate."
-        return StepResult(spec, Section("Actuators", f"{NOT_FITTED} {needed}"))
-    fit = fit_actuators(tracks, spec, seed)
-    return StepResult(fit.spec, motion.actuators(fit))
+        return StepResult(arm, Section("Actuators", f"{NOT_FITTED} {needed}"))
+    fit = fit_actuators(tracks, arm.spec, seed)
+    return StepResult(arm._replace(spec=fit.spec), sections.actuators(fit))
 
 
-def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
+def damping(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
     """Fit the damping of chambers and backbone to the moving arm."""
+    spec = arm.spec
     stretches = find_stretches(measurements.logs, spec)
     if not stretches:
         needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
-        return StepResult(spec, Section("Damping", f"{NOT_FITTED} {needed}"))
+        return StepResult(arm, Section("Damping", f"{NOT_FITTED} {needed}"))
     # The lag of the shape shows the backbone's damping by itself
     shape, prior = fit_shape(measurements.logs, spec), PRIOR
     if shape is not None and shape.is_better:
         spec, prior = shape.spec, min(shape.log_std, PRIOR)
     fit = fit_damping(stretches, spec, seed, prior)
-    return StepResult(fit.spec if fit.is_better else spec, motion.damping(fit, shape))
+    return StepResult(arm._replace(spec=fit.spec if fit.is_better else spec), sections.damping(fit, shape))
 
 
-def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
-    """Fit the sim-to-real network, and the pressures that hold the arm, to poses of the unloaded arm."""
-    # Settle the simulated arm at the spring lengths of these poses; with a payload its poses would differ.
-    poses = measurements.poses.with_lengths(spec)
-    used = _unloaded(poses, spec)
-    simulated = simulate_poses(spec, poses.spring_m[used]) if len(used) else None
-    n_settled = 0 if simulated is None else int(np.count_nonzero(simulated.valid))
-    n_unsettled = len(used) - n_settled
-    if simulated is None or n_settled < MIN_S2R_POSES:
+def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool = False) -> StepResult:
+    """Fit the sim-to-real network, and the pressures that hold the arm, to poses of the unloaded arm.
+
+    With `printed` the network is the paper's, and the section shows the process beside it.
+    """
+    spec = arm.spec
+    found = _settled_poses(measurements, spec)
+    if len(found.rows) < MIN_S2R_POSES:
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
-        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": n_unsettled}
-        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, uses)}"
+        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": found.n_unsettled}
+        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, len(found.rows), uses)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
-        return StepResult(spec, Section("Sim-to-real network", needed, warnings=(remedy,)))
-    used, settled = used[simulated.valid], simulated.take(simulated.valid)
-    real = pose_from_frame(poses.tip_m[used], poses.tip_rotation[used])
+        return StepResult(arm, Section("Sim-to-real network", needed, warnings=(remedy,)))
+    poses, rows, settled, real, n_unsettled = found
     # Fit the network from simulated to measured tips.
     fit = fit_s2r(spec, settled, real, seed)
-    section = sections.s2r(fit, settled.pose, settled.spring_m, real, n_unsettled)
+    others = (fit,) if printed else ()
+    fit = fit_s2r(spec, settled, real, seed, printed=True) if printed else fit
+    section = sections.s2r(fit, settled.pose, settled.spring_m, real, n_unsettled, others)
     corrected, away = (f(fit.s2r, settled.pose, settled.spring_m) for f in (correct, extrapolation))
     pairs = {
         "simulated": PosePairs(real, settled.pose, np.zeros(len(real), bool)),
         "with the network": PosePairs(real, corrected, away > 1.0),
     }
     # Fit the pressures that hold the arm.
-    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
-    extras = Extras(pairs=pairs)
+    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[rows], settled.pressure_kpa, seed)
     if fit.is_better:
-        extras["s2r"] = fit.s2r
+        arm = arm._replace(s2r=fit.s2r)
     if not held.is_better:
-        return StepResult(spec, section, extras)
-    extras["held"] = held.held
+        return StepResult(arm, section, pairs)
     spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
+    arm = arm._replace(spec=spec, held=held.held)
     largest_kg = spec.mass.largest_payload_kg
-    at = payload_poses(CalibratedArm(spec, extras.get("s2r")))
-    widths_kg = told_widths(held.held, at, largest_kg)
+    unloaded = payload_poses(arm._replace(held=None))
+    widths_kg = payload_intervals(held.held, unloaded, largest_kg)
     section = sections.with_pressures(section, held, widths_kg, KNOWN * largest_kg)
-    return StepResult(spec, section, extras)
+    return StepResult(arm, section, pairs)
+
+
+def s2r_errors(measurements: Measurements, arm: CalibratedArm, seed: int = 0) -> dict[str, PoseErrors]:
+    """Return errors of tips at the held-out poses of a calibration's network.
+
+    Args:
+        measurements: measurements of the calibration.
+        arm: calibrated arm, with its network.
+        seed: seed of the calibration.
+
+    Returns:
+        Errors of the simulated arm, of the paper's network fitted to the other poses, and of the arm's S2R.
+    """
+    _, _, settled, real, _ = _settled_poses(measurements, arm.spec)
+    held_out = held_out_blocks(len(real), block=block_rows(len(real)), seed=seed)
+    judged = settled.take(held_out)
+    printed = fit_printed(settled.take(~held_out), real[~held_out], seed)
+    poses = {"simulated": judged.pose, "as printed": moved(judged.pose, printed(judged))}
+    if arm.s2r is not None:
+        poses["calibrated"] = correct(arm.s2r, judged.pose, judged.spring_m)
+    return {name: pose_errors(np.asarray(pose, float), real[held_out]) for name, pose in poses.items()}
+
+
+class _SettledPoses(NamedTuple):
+    """Poses of the unloaded arm at whose spring lengths the simulated arm finds rest."""
+
+    poses: StaticPoses  # all static poses
+    rows: np.ndarray  # (n,) indices of the poses that settled
+    simulated: SimulatedPoses  # n poses
+    real: np.ndarray  # (n, 6) [mm, deg]
+    n_unsettled: int
+
+
+def _settled_poses(measurements: Measurements, spec: ArmSpec) -> _SettledPoses:
+    """Settle the simulated arm at the spring lengths of the unloaded arm; a payload would move the tip."""
+    poses = measurements.poses.with_lengths(spec)
+    rows = _unloaded(poses, spec)
+    # Without any pose, simulate one in vain: the arrays keep their shapes.
+    spring_m = poses.spring_m[rows] if len(rows) else np.ones((1, spec.n_springs))
+    simulated = simulate_poses(spec, spring_m)
+    settled = np.flatnonzero(simulated.valid[: len(rows)])
+    n_unsettled = len(rows) - len(settled)
+    rows = rows[settled]
+    real = pose_from_frame(poses.tip_m[rows], poses.tip_rotation[rows])
+    return _SettledPoses(poses, rows, simulated.take(settled), real, n_unsettled)
 
 
 def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
@@ -178,10 +224,10 @@ def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepRe
         what = "pressures and spring lengths, without a payload"
         needed = f"{NOT_FITTED} {_few(MIN_LATER, what, poses.n, measurements.row_uses)}"
         remedy = f"what has changed is not known: measure {MIN_LATER} goals or more"
-        return StepResult(spec, Section(CHANGES, needed, warnings=(remedy,)))
-    found = fit_changes(arm, poses, seed)
-    section = changes_section(found, 0.0 if s2r is None else float(s2r.error_mm))
-    return StepResult(found.spec if found.is_better else spec, section)
+        return StepResult(arm, Section(sections.CHANGES, needed, warnings=(remedy,)))
+    fit = fit_changes(arm, poses, seed)
+    section = sections.changes(fit, 0.0 if s2r is None else float(s2r.error_mm))
+    return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, section)
 
 
 def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
@@ -189,7 +235,7 @@ def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
     spec, held = arm.spec, arm.held
     if held is None:
         remedy = f"no residual pressures: record {MIN_S2R_POSES} poses at rest or more, and calibrate anew"
-        return StepResult(spec, Section(PAYLOADS, NOT_FITTED, warnings=(remedy,)))
+        return StepResult(arm, Section(sections.PAYLOADS, NOT_FITTED, warnings=(remedy,)))
     # Take heavy poses that the simulated arm holds.
     poses = measurements.poses.with_lengths(spec)
     poses = poses.take(np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1)))
@@ -202,14 +248,13 @@ def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
         needed = f"{NOT_FITTED} {_few(MIN_WEIGHED, what, len(rows), measurements.row_uses)}"
         got = f"got {len(rows)} poses with {1e3 * least_kg:.0f} g or more, expected {MIN_WEIGHED}"
         remedy = "measure more goals with a known weight (`deploy measure --payload`)"
-        return StepResult(spec, Section(PAYLOADS, needed, warnings=(f"{got}: {remedy}",)))
+        return StepResult(arm, Section(sections.PAYLOADS, needed, warnings=(f"{got}: {remedy}",)))
     # Fit them; a ratio that no arm has is not believed.
-    found = weighed(arm, poses, rows)
-    section = payloads_section(found)
-    if not found.is_plausible:
-        return StepResult(spec, section)
-    known = held._replace(factor=found.factor, factor_sd=found.factor_sd)
-    return StepResult(spec, section, Extras(held=known))
+    fit = fit_payload_scale(arm, poses, rows)
+    section = sections.payloads(fit)
+    if not fit.is_plausible:
+        return StepResult(arm, section)
+    return StepResult(arm._replace(held=held._replace(factor=fit.factor, factor_sd=fit.factor_sd)), section)
 
 
 STEPS: Mapping[str, Step] = MappingProxyType(

@@ -38,7 +38,7 @@ HELD_OUT_BLOCK = 5  # poses
 SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # first guess for tip [m], rotation [rad], springs [m] and markers [m]
 MIN_SCALE = (1e-4, 1e-3, 1e-4, 1e-4)  # least values of the same scales
 MAX_RATIO = 2.0  # warn from this ratio of calibrated to specified values, or of held-out to other errors
-TOLD_TURN_DEG = 1.0  # turn of the measured tip from which a note tells it
+NOTED_TURN_DEG = 1.0  # turn of the measured tip from which there is a note
 MAX_PRESSURE_GAP = 0.1  # share of the pressure range that may be missing at either end
 
 
@@ -81,7 +81,7 @@ class ChamberFit:
     def notes(self) -> tuple[str, ...]:
         """Say whether motion capture's axes of the tip differ from the axes of the last plate."""
         turn_deg = np.linalg.norm(self.spec.mounting.tip_turn_deg)
-        if turn_deg < TOLD_TURN_DEG:
+        if turn_deg < NOTED_TURN_DEG:
             return ()
         return (
             f"the tip's measured quaternion is {turn_deg:.1f} deg off with the arm straight. The "

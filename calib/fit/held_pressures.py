@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import rms_of
+from calib.fit.likelihood import Hyperparameters, most_likely
 from mjx_softarm.control import allocation, chambers_of_springs
 from mjx_softarm.sensing.held_pressures import HeldPressures, kernel, residual, sections_of
 from mjx_softarm.sensing.hysteresis import stops
@@ -132,18 +132,9 @@ def _hysteresis(state: np.ndarray, left_kpa: np.ndarray, stop: np.ndarray) -> tu
     return kpa, 0.5 * information * kpa**2
 
 
-def _most_likely(state: np.ndarray, left_kpa: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Return length, noise and covariance (c, c) that make a section's residuals (n, c) most likely."""
-    n, c = left_kpa.shape
-    best = (np.inf, 0.0, 0.0, np.eye(c))
-    for length in LENGTHS:
-        likeness = kernel(state, state, length)
-        for noise in NOISES:
-            factor = cholesky(likeness + noise * np.eye(n), lower=True, check_finite=False)
-            covariance = left_kpa.T @ cho_solve((factor, True), left_kpa) / n + LEAST_KPA**2 * np.eye(c)
-            unlikely = c * np.log(np.diag(factor)).sum() + 0.5 * n * np.linalg.slogdet(covariance)[1]
-            best = min(best, (float(unlikely), length, noise, covariance), key=lambda found: found[0])
-    return best[1:]
+def _most_likely(state: np.ndarray, left_kpa: np.ndarray) -> Hyperparameters:
+    """Return the hyperparameters that make a section's residuals (n, c) most likely."""
+    return most_likely(left_kpa, lambda length: kernel(state, state, length), LENGTHS, NOISES, LEAST_KPA**2)
 
 
 def without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec: ArmSpec) -> np.ndarray:

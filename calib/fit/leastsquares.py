@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_softarm.sensing.load import QUANTILE
+
 NOT_CONVERGED = "the fit did not converge: start from a specification closer to the arm (--spec)"
 ROUNDS = ("linear", "huber", "huber")  # losses; the first round has the given scales
 # End of a round. Single precision allows no smaller changes; SciPy's third test depends on the units of x.
@@ -26,7 +28,6 @@ NEWTON_STEPS = 5  # at most, after the rounds, as each round has the scales of t
 SMALL_STEP = 0.1  # greatest distance of a converged fit from its minimum, in standard deviations
 NO_ANSWER = 30.0  # error, in scales, of a row for which the model has no answer
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation of a normal variable over its median absolute value
-QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
 
 # x (p,) -> errors (n, m), NaN where not measured, inf in rows without an answer; Jacobian (n, m, p)
 Model = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]

@@ -282,7 +282,10 @@ def _with_widths(
     if not fit_share and k > 1:
         columns = zip(x.T[..., None], y.T[..., None], slope[:, None], offset[:, None], strict=True)
         each = [_with_widths(*column, share, start_share, False) for column in columns]
-        return _Lines(*(np.concatenate(values) for values in list(zip(*each, strict=True))[:5]), share, 0.0)
+        slope, offset, slope_width, offset_width, noise = (
+            np.concatenate(values) for values in list(zip(*each, strict=True))[:5]
+        )
+        return _Lines(slope, offset, slope_width, offset_width, noise, share, 0.0)
     # Standardise the columns; parameters are slopes, offsets and, if fitted, the share.
     wire, y_spread = np.where(np.isfinite(y), wire_length(x, share), np.nan), _spread(y)
     centre, spread = np.nanmean(wire, axis=0), _spread(wire)
@@ -339,7 +342,7 @@ def _warnings(fit: LineFit, wire: np.ndarray, name: str) -> tuple[str, ...]:
         reasons = {
             f"got {n} rows, expected {MIN_ROWS} or more: measure more": n < MIN_ROWS,
             f"lengths spread by {range_y:.3g} only, noise being {noise:.3g}, so slope and offset can hardly "
-            "be told apart: measure over the whole range": range_y < 5 * noise,
+            "be separated: measure over the whole range": range_y < 5 * noise,
             f"held-out error {held_out:.3g} extrapolates in {100 * fit.beyond[k]:.0f} % of rows: measure the "
             "shortest and the longest lengths more than once, at different times": fit.beyond[k] > MAX_BEYOND,
             f"held-out error {held_out:.3g}, on its own rows {rms:.3g}: measure more rows, in random order": (

@@ -1,8 +1,8 @@
 """Small network fitted to rows of a log, or to a process that was fitted to them; bounded, stopped early.
 
 A linear map is fitted first, and a network learns its residual. Both are joined to one network, which is
-stored and run as one. Its inputs and outputs stay within the range of the rows, and anchors tell how far an
-input is from all rows.
+stored and run as one. Its inputs and outputs stay within the range of the rows, and anchors measure how far
+an input is from all rows.
 """
 
 from __future__ import annotations
@@ -33,12 +33,16 @@ class NetworkConfig:
 
     hidden: tuple[int, ...]
     schedule: Schedule
+    line: bool = True  # fit a linear map first, and the network to its residual
 
 
 # Rows of a log are few and noisy, so weights decay. Learning rate and batch size are the paper's.
 OF_ROWS = NetworkConfig((64, 64), Schedule(3_000, 0.01, 128, weight_decay=0.3))
 # The mean of a process has no noise.
 OF_PROCESS = NetworkConfig((192, 192), Schedule(12_000, 4e-3, 512))
+# The paper's network from P and L_spring to P_S2R: Adam with 0.01, batches of 128. The paper leaves layers
+# and number of updates open: these are the numbers of `OF_ROWS`.
+PRINTED = NetworkConfig((64, 64), Schedule(3_000, 0.01, 128, last_share=1.0), line=False)
 
 
 class NetworkFit(NamedTuple):
@@ -78,7 +82,7 @@ def fit_network(
     if points is not None:
         z, y, stop = np.clip(normalised(points[0]), -1.0, 1.0), points[1], None
     # Fit a linear map, then a network to its residual.
-    linear, _ = ridge(z, y, RIDGE)
+    linear = ridge(z, y, RIDGE)[0] if config.line else np.zeros((z.shape[1], y.shape[1]))
     left = y - z @ linear
     centre, spread = left.mean(axis=0), left.std(axis=0)
     spread = np.where(spread > 0.0, spread, 1.0)

@@ -10,7 +10,7 @@ Each entry is a change from the specification:
   from the model, too: it is a number of the model rather than of the bellows
 - mounting: turn of the base about its own x and y, and its offset; roll of each section's holes; turn of the
   measured tip, and its offset within the last plate. A turn of the base about its own z is a roll of all
-  sections. An axial offset of the tip cannot be told from an offset of the base.
+  sections. An axial offset of the tip cannot be distinguished from an offset of the base.
 - sites of the markers at the sections' ends, each within its plate, since markers are stuck on by hand
 
 A section stretches and bends: three degrees of freedom. Rest lengths of its chambers act through one force
@@ -30,10 +30,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from calib.fit.leastsquares import QUANTILE
 from mjx_softarm._support.fields import scaled
 from mjx_softarm._support.small_matrices import product
 from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.sensing.pose import rotation_about, rotation_from_quaternion, rotation_vector
 from mjx_softarm.spec import BONDS, ArmSpec, Structure
 
@@ -75,7 +75,7 @@ BLOCKS = (
 def priors(spec: ArmSpec) -> np.ndarray:
     """Return standard deviations (p,) about the start."""
     values = _of_each(spec, "prior")
-    if spec.structure.links_per_section == 1:  # no links of a section to tell a bond by
+    if spec.structure.links_per_section == 1:  # a bond shows in the links of a section only
         values[names(spec).index(BOND)] = FIXED
     return values
 

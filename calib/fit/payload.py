@@ -1,4 +1,4 @@
-"""Accuracy with which springs and pressures tell an arm's payload, over the workspace.
+"""Accuracy of the payload that springs and pressures show, over the workspace.
 
 A payload m changes the pressures that hold given springs by m e. The residual pressures of the sections
 (`mjx_softarm.sensing.held_pressures`) have the covariances v_s V_s. By generalised least squares, the
@@ -13,11 +13,11 @@ of virtual work, chambers of effective areas A that lift a payload at the height
 
 So where the sim-to-real network raises the simulated tip by h, e grows by g (dh / dc) / A. A real arm's tip
 lies up to some centimetres aside of the simulated one, which is a lever of a payload. At random poses of rods
-100 to 104, 500 g are told with RMS errors of 23 to 47 g; without this part of e, 26 to 61 g. On the circle
-with 1 kg it helps three of them.
+100 to 104, 500 g are estimated with RMS errors of 23 to 47 g; without this part of e, 26 to 61 g. On the
+circle with 1 kg it helps three of them.
 
 What is left of e is a factor that is alike for all chambers and for poses that are alike. Poses with a known
-weight tell it (`weighed`).
+weight show it (`fit_payload_scale`).
 """
 
 from __future__ import annotations
@@ -53,11 +53,12 @@ from mjx_softarm.sensing.s2r import S2R, corrected
 
 N_POSES, SEED = 400, 1  # poses over the workspace, and their seed
 # Poses with a known weight: fewer do not show how far they scatter. Least weight, as a share of the largest
-# payload: less is hardly told from errors of the pressures.
+# payload: less is hardly above errors of the pressures.
 MIN_WEIGHED, LEAST_WEIGHT = 8, 0.25
 MOST_OFF = 0.3  # six standard deviations of a factor
 # Standard deviation of a fitted factor at poses like those of the fit. On the circle of rods 100 to 104,
-# which no experiment uses, 500 g tell 1 kg to 0.007. Factors of random poses are off there by 0.037.
+# which no experiment uses, 500 g give the factor of 1 kg to 0.007. Factors of random poses are off there by
+# 0.037.
 LEFT_FACTOR = 0.02
 
 
@@ -133,8 +134,8 @@ def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float
     return QUANTILE / np.sqrt(information)
 
 
-def told_widths(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tuple[float, float]:
-    """Return how well payloads are told over the workspace, as half-widths [kg] of 95 % intervals.
+def payload_intervals(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tuple[float, float]:
+    """Return the accuracy of payloads over the workspace, as half-widths [kg] of 95 % intervals.
 
     Returns:
         Median over the poses without a payload; 95 % of the poses with the largest payload have less.
@@ -143,7 +144,7 @@ def told_widths(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tup
     return float(np.median(none)), float(np.quantile(largest, 0.95))
 
 
-def told_payload(
+def estimated_payload(
     arm: CalibratedArm, spring_m: np.ndarray, pressure_kpa: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return payloads (m,) [kg] of arms at rest, and half-widths (m,) of their 95 % intervals.
@@ -168,10 +169,10 @@ def told_payload(
     return payload_kg, QUANTILE * np.sqrt(variance)
 
 
-class Weighed(NamedTuple):
-    """Factor of all payloads by poses with a known weight, and how well the weight itself was told."""
+class PayloadScaleFit(NamedTuple):
+    """Factor of all payloads by poses with a known weight, and the estimate of the weight itself."""
 
-    ratio: float  # payload that was told, over the weight
+    ratio: float  # estimated payload over the weight
     factor: float  # new `HeldPressures.factor`
     factor_sd: float
     n: int  # poses
@@ -182,7 +183,7 @@ class Weighed(NamedTuple):
         return abs(self.ratio - 1.0) < MOST_OFF
 
 
-def weighed(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> Weighed:
+def fit_payload_scale(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> PayloadScaleFit:
     """Fit the factor of payloads to poses with a known weight.
 
     Args:
@@ -193,18 +194,18 @@ def weighed(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) -> Weighed
     spec, held = arm.spec, arm.held
     if held is None:
         raise ValueError("arm.held: got None, expected residual pressures")
-    # Tell the weights by what pressures remain
+    # Estimate the weights from the pressures that remain
     weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
     kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
     kpa = kpa - hysteresis_kpa(spec, held, poses.spring_m)[rows] - spec.unmodelled_kpa
-    told_kg, _ = told_payload(arm, spring_m, kpa)
-    # Least squares for their ratio, with a prior: what a weight can tell of a factor's deviation
+    estimated_kg, _ = estimated_payload(arm, spring_m, kpa)
+    # Least squares for their ratio, with a prior: the part of a factor's deviation that a weight shows
     information, prior = np.sum(weight_kg**2), COMMON_FACTOR**2 - LEFT_FACTOR**2
-    ratio = np.sum(told_kg * weight_kg) / information
-    variance = np.sum((told_kg - ratio * weight_kg) ** 2) / (len(rows) - 1) / information
+    ratio = np.sum(estimated_kg * weight_kg) / information
+    variance = np.sum((estimated_kg - ratio * weight_kg) ** 2) / (len(rows) - 1) / information
     share = prior / (prior + variance)
     factor, sd = held.factor * (1.0 + share * (ratio - 1.0)), np.sqrt(share * variance + LEFT_FACTOR**2)
-    return Weighed(float(ratio), float(factor), float(sd), len(rows))
+    return PayloadScaleFit(float(ratio), float(factor), float(sd), len(rows))
 
 
 def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -> np.ndarray:

@@ -6,12 +6,16 @@ Rows are few, so a Gaussian process that knows of sections (`calib.fit.section_p
 The network learns its mean, at the rows and at simulated arms all over the workspace. Contiguous blocks of
 rows take part in neither, and measure the error.
 
+The paper's own network is a choice: from (P, L_spring) straight to P_S2R in R^6, by mean squared error, Adam
+with 0.01 and batches of 128. It takes the place of the process: the file's network learns its answers.
+
 Source: Sim-to-Real Transfer in Meng et al.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,17 +23,25 @@ import jax
 import numpy as np
 
 from calib.fit.blocks import block_rows, held_out_blocks
-from calib.fit.network import NetworkConfig, fit_network
+from calib.fit.network import PRINTED, NetworkConfig, fit_network
 from calib.fit.pose_errors import PoseErrors, pose_errors
-from calib.fit.section_process import SectionProcess, Sections, fit_process, predict, sections
+from calib.fit.section_process import Sections, fit_process, predict, sections
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import arms_at_once, settle
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, correct, correction_between, extrapolation, inputs
+from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame
+from mjx_softarm.sensing.s2r import (
+    S2R,
+    apply_correction,
+    correct,
+    correction,
+    correction_between,
+    extrapolation,
+    inputs,
+)
 from mjx_softarm.spec import ArmSpec
 
 MIN_ROWS = 200  # rows below which there is a warning
@@ -38,7 +50,8 @@ MAX_TURN_DEG = 90.0  # angle between real and simulated tips from which there is
 MAX_HELD_OUT_RATIO = 3.0  # ratio of held-out to training errors from which there is a warning
 GOOD_SHARE = 0.1  # share of the error without the network below which there is no warning
 BATCH = 512  # poses simulated together
-N_POINTS = 24_000  # simulated arms at random pressures, at which the network learns the process
+N_POINTS = 24_000  # simulated arms at random pressures, at which the network learns the model
+PROCESS, PRINTED_NETWORK = "Gaussian process of the sections", "network as printed in the paper"
 
 
 class SimulatedPoses(NamedTuple):
@@ -55,6 +68,9 @@ class SimulatedPoses(NamedTuple):
         return jax.tree.map(lambda values: values[rows], self)
 
 
+Model = Callable[[SimulatedPoses], np.ndarray]  # corrections (n, 6) [mm, Gibbs vector] of simulated poses
+
+
 @dataclass(frozen=True, eq=False)
 class S2RFit:
     """Sim-to-real network and whether to trust it."""
@@ -64,6 +80,8 @@ class S2RFit:
     in_sample: PoseErrors
     test: PoseErrors  # held-out rows
     test_uncorrected: PoseErrors
+    model: str  # name of the model that the network learned: `PROCESS` or `PRINTED_NETWORK`
+    test_model: PoseErrors  # errors of that model itself at held-out rows
     stop_epoch: int  # epoch whose weights are the network's
     n_epochs: int
     flagged_share: float  # share of the held-out rows with extrapolation above 1
@@ -112,6 +130,7 @@ def fit_s2r(
     pose_real: np.ndarray,
     seed: int = 0,
     config: NetworkConfig | None = None,
+    printed: bool = False,
 ) -> S2RFit:
     """Fit a network from simulated poses and spring lengths to real poses.
 
@@ -121,15 +140,17 @@ def fit_s2r(
         pose_real (n, 6) [mm, deg]: measured poses in the base frame.
         seed: seed of all random draws.
         config: training settings.
+        printed: fit the paper's network in place of the process.
     """
     n = len(simulated.pose)
     arrays = (simulated.pose, simulated.spring_m, pose_real)
     pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in arrays)
     held_out = held_out_blocks(n, block=block_rows(n), seed=seed)
-    # Fit the process to the rows, and the network to the process.
+    # Fit the process, or the paper's network, to the rows, and the network to its answers.
     x, y = inputs(frame_from_pose(pose_sim), spring_m), correction_between(pose_sim, pose_real)
-    process = fit_process(simulated.sections.take(~held_out), y[~held_out])
-    points = _points(spec, process, spring_m[~held_out], seed)
+    rows = simulated.take(~held_out)
+    model = fit_printed(rows, pose_real[~held_out], seed) if printed else _process(rows, y[~held_out])
+    points = _points(spec, model, spring_m[~held_out], seed)
     fit = fit_network(x[~held_out], y[~held_out], seed, config, points)
     # Judge it by the held-out rows.
     corrected = correct(fit.network, pose_sim, spring_m)
@@ -138,12 +159,15 @@ def fit_s2r(
         "test": pose_errors(corrected[held_out], pose_real[held_out]),
         "test_uncorrected": pose_errors(pose_sim[held_out], pose_real[held_out]),
     }
+    by_model = moved(pose_sim[held_out], model(simulated.take(held_out)))
     flagged = extrapolation(fit.network, pose_sim[held_out], spring_m[held_out]) > 1.0
     turn_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(y[:, 3:], axis=1)))
     return S2RFit(
         s2r=fit.network._replace(error_mm=np.float32(errors["test"].translation_mean_mm)),
         held_out=held_out,
         **errors,
+        model=PRINTED_NETWORK if printed else PROCESS,
+        test_model=pose_errors(by_model, pose_real[held_out]),
         stop_epoch=fit.stop_epoch,
         n_epochs=fit.n_epochs,
         flagged_share=float(flagged.mean()),
@@ -151,15 +175,42 @@ def fit_s2r(
     )
 
 
-def _points(
-    spec: ArmSpec, process: SectionProcess, spring_m: np.ndarray, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs of the network and means of a process, at rows of springs and all over the workspace."""
+def _process(simulated: SimulatedPoses, y: np.ndarray) -> Model:
+    """Fit the process of the sections to corrections y (n, 6) of simulated poses."""
+    process = fit_process(simulated.sections, y)
+    return lambda simulated: predict(process, simulated.sections)
+
+
+def fit_printed(simulated: SimulatedPoses, pose_real: np.ndarray, seed: int = 0) -> Model:
+    """Fit the paper's network from simulated poses and spring lengths to real poses (n, 6) [mm, deg].
+
+    Inputs are scaled to -1 to 1 and outputs to unit spread, and angles do not jump by 360 degrees. Some rows
+    choose the epoch. The paper states none of these.
+    """
+
+    def inputs(simulated: SimulatedPoses) -> np.ndarray:
+        return np.concatenate([simulated.pose, simulated.spring_m], axis=1).astype(float)
+
+    pose = np.asarray(simulated.pose, float)
+    near = pose + pose_error(np.asarray(pose_real, float), pose)
+    network = fit_network(inputs(simulated), near, seed, PRINTED).network
+    return lambda simulated: correction_between(
+        np.asarray(simulated.pose, float), np.asarray(correction(network, inputs(simulated)), float)
+    )
+
+
+def moved(pose: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return poses (n, 6) [mm, deg] moved by changes (n, 6) [mm, Gibbs vector]."""
+    return pose_from_frame(*apply_correction(frame_from_pose(np.asarray(pose, float)), change))
+
+
+def _points(spec: ArmSpec, model: Model, spring_m: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return inputs of the network and answers of a model, at rows of springs and all over the workspace."""
     found = settle_many(spec, random_pressures(spec, N_POINTS, seed))
     over = np.clip(found.spring_m[found.settled], spring_m.min(axis=0), spring_m.max(axis=0))
     simulated = simulate_poses(spec, np.concatenate([spring_m, over]))
     settled = simulated.take(simulated.valid)
-    return inputs(frame_from_pose(settled.pose), settled.spring_m), predict(process, settled.sections)
+    return inputs(frame_from_pose(settled.pose), settled.spring_m), model(settled)
 
 
 def _warnings(n: int, turn_deg: np.ndarray, errors: dict[str, PoseErrors]) -> list[str]:

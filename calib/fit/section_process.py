@@ -11,7 +11,7 @@ tip, the correction of the tip is
 Each g_s is a Gaussian process with the covariance v (1 + exp(-|u - u'|^2 / (2 l^2))), so y is one, too. Of a
 grid, the length l and the noise are taken that make the rows most likely; the variance v has a closed form.
 
-Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, sections 2.2 and 5.4.
+Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.linalg import cho_solve, cholesky
 
+from calib.fit.likelihood import most_likely, solve
 from mjx_softarm.mechanics.kinematics import Frames
 from mjx_softarm.mechanics.params import ArmParams
 
@@ -31,6 +31,7 @@ LENGTHS = (2.0, 3.0, 4.5, 7.0)  # distances of states, see `sections`
 NOISES = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)  # variances over the variance of a section
 MAX_GRID_ROWS = 200  # rows by which length and noise are chosen
 MAX_ROWS = 1_000  # rows of the process
+LEAST = 1e-12  # [mm^2] least variance of a section
 N_OUTPUTS = 6  # shift [mm], Gibbs vector
 
 
@@ -62,7 +63,7 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
 
     A state holds spring lengths in quarters of the section's length, the vertical in the section's axes, and
     the moment of the weights below, in units of the whole arm's weight half the section's length aside. More
-    than three springs, which tell no more than three, weigh as much as three.
+    than three springs, which measure no more than three do, weigh as much as three.
 
     Args:
         frames: plates and joints of the arm at rest.
@@ -99,8 +100,12 @@ def fit_process(rows: Sections, y: np.ndarray) -> SectionProcess:
     At most `MAX_ROWS` rows take part, evenly spread.
     """
     rows, y = _some(Sections(*(np.asarray(values, float) for values in rows)), y, MAX_ROWS)
-    length, noise = _most_likely(*_some(rows, y, MAX_GRID_ROWS))
-    weight = _solve(_covariance(rows, rows, length), noise, (y * _units(rows)).ravel())[0]
+    few, few_y = _some(rows, y, MAX_GRID_ROWS)
+    movement = (few_y * _units(few)).reshape(-1, 1)
+    length, noise, _ = most_likely(
+        movement, lambda length: _covariance(few, few, length), LENGTHS, NOISES, LEAST
+    )
+    weight, _ = solve(_covariance(rows, rows, length), noise, (y * _units(rows)).ravel())
     at_sections = np.einsum("nsji,nj->nsi", rows.effect, weight.reshape(len(y), N_OUTPUTS))
     return SectionProcess(rows, length, at_sections)
 
@@ -117,25 +122,6 @@ def predict(process: SectionProcess, at: Sections) -> np.ndarray:
 def _some(rows: Sections, y: np.ndarray, n: int) -> tuple[Sections, np.ndarray]:
     chosen = np.linspace(0, len(y) - 1, min(n, len(y))).round().astype(int)
     return rows.take(chosen), y[chosen]
-
-
-def _most_likely(rows: Sections, y: np.ndarray) -> tuple[float, float]:
-    """Return the length and the noise of the grid that make the corrections most likely."""
-    off, best = (y * _units(rows)).ravel(), (np.inf, 0.0, 0.0)
-    for length in LENGTHS:
-        covariance = _covariance(rows, rows, length)
-        for noise in NOISES:
-            weight, half_log_determinant = _solve(covariance, noise, off)
-            variance = max(float(off @ weight) / len(off), 1e-12)
-            unlikely = 0.5 * len(off) * np.log(variance) + half_log_determinant
-            best = min(best, (unlikely, length, noise))
-    return best[1:]
-
-
-def _solve(covariance: np.ndarray, noise: float, y: np.ndarray) -> tuple[np.ndarray, float]:
-    """Solve the covariance with noise for y; return also half the logarithm of its determinant."""
-    factor = cholesky(covariance + noise * np.eye(len(y)), lower=True, check_finite=False)
-    return cho_solve((factor, True), y, check_finite=False), float(np.log(np.diag(factor)).sum())
 
 
 def _covariance(a: Sections, b: Sections, length: float) -> np.ndarray:

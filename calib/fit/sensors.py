@@ -3,7 +3,7 @@
 Each spring has a robust line, or all have one; see `calib.fit.lines`.
 
 Of a coil, L = beta K w / (1 - I_comp w) + delta with w = C (2 pi f)^2. This stays the same when C grows by a
-factor and beta and I_comp shrink by it, so C keeps its given value. The curvature of L against f^2 tells
+factor and beta and I_comp shrink by it, so C keeps its given value. The curvature of L against f^2 shows
 I_comp, one for all springs, if the lengths reach far enough.
 """
 

@@ -4,7 +4,7 @@
 unit) is refused. Otherwise each row is kept or dropped whole. A row is dropped for a NaN, a reading out of
 range, a time that does not increase, motion capture that was not renewed or is turned, or an outlier; only
 references, goals and estimates of the control loop may be NaN. Signs of quaternions are repaired. Columns
-that never change, time gaps and unknown columns are only reported. Each finding tells how many rows it
+that never change, time gaps and unknown columns are only reported. Each finding has the number of rows it
 dropped.
 """
 

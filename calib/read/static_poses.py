@@ -3,7 +3,7 @@
 In a log of the control loop the pressures change until each arrival. There a pose is the window that ends
 with the last row of a goal that stood, if the springs are still over it by the loop's own rule. Windows after
 earlier actions do not count: 2 s after an action a twin's tip is 3 to 4 mm from its rest at the same springs.
-The log does not tell two equal goals in a row apart, which give one pose.
+Two equal goals in a row are one goal of the log, and give one pose.
 """
 
 from __future__ import annotations

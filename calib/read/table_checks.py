@@ -31,8 +31,8 @@ class Plausible(NamedTuple):
 
 
 # A column whose median is outside has the wrong unit, or is another column; a row with a value outside is
-# dropped. The bounds tell mm from cm and m for such an arm, and Pa from kPa and bar. They cannot tell psi
-# from kPa, rad from deg, or one chamber from another.
+# dropped. The bounds distinguish mm from cm and m for such an arm, and Pa from kPa and bar. They cannot
+# distinguish psi from kPa, rad from deg, or one chamber from another.
 PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
     {
         "time": Plausible(5e-4, 19.0),  # median step: 2 kHz down to a pose every 19 s

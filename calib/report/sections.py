@@ -1,26 +1,36 @@
-"""Sections of the report on springs, chambers and the sim-to-real network: numbers, tables, drawings."""
+"""Sections of the report: each shows the numbers of a fit in words, tables and drawings."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from calib.changes import Changes
 from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import PressureFit
 from calib.fit.markers import MarkerLimits
+from calib.fit.motion.actuators import MARGIN, SMALL_KPA, ActuatorFit
+from calib.fit.motion.damping import DampingFit
+from calib.fit.motion.shape import ShapeFit
 from calib.fit.parameters import BENDING, BOND, without_effect
+from calib.fit.payload import MOST_OFF, PayloadScaleFit
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
-from calib.report.page import ReportTable, Section, plain
+from calib.report.page import ReportTable, Section, as_json, plain
 from mjx_softarm._support.fields import PerSection
+from mjx_softarm.pneumatics import Regulator
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.sensing.s2r import correct
 
 _BINS = 40
+CHANGES, PAYLOADS = "Changes", "Payloads"
+ENOUGH = 2.0  # held-out error over that of the calibration, from which there is a warning; by hand
 
 
 def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
@@ -108,7 +118,7 @@ def chambers(fit: ChamberFit) -> Section:
         + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
         (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
-        plain(fit, "spec", "covariance", "poses", "is_held_out", "tip_error_mm", "chamber_m")
+        plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
         | {"values": values | dict(parts) | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
         fit.notes,
@@ -155,7 +165,14 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
     )
 
 
-def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Section:
+def s2r(
+    fit: S2RFit,
+    pose: np.ndarray,
+    spring_m: np.ndarray,
+    real: np.ndarray,
+    n_unsettled: int,
+    others: Sequence[S2RFit] = (),
+) -> Section:
     """Show distances of simulated to real poses, with and without the network.
 
     Args:
@@ -164,12 +181,22 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         spring_m (n, n_springs) [m]: their spring lengths.
         real (n, 6) [mm, deg]: measured poses.
         n_unsettled: number of other poses, at whose spring lengths the simulated arm did not settle.
+        others: fits to the same poses that were not chosen.
     """
     # The table of errors, and the histogram of the held-out ones.
     errors = _errors(
         ("held-out poses, simulated", fit.test_uncorrected),
         ("held-out poses, corrected", fit.test),
         ("poses of the fit, corrected", fit.in_sample),
+        (f"held-out poses, {fit.model}", fit.test_model),
+        *(
+            row
+            for other in others
+            for row in (
+                (f"held-out poses, {other.model}", other.test_model),
+                (f"held-out poses, network of the {other.model}", other.test),
+            )
+        ),
     )
     corrected = correct(fit.s2r, pose, spring_m)
     figure, axes = _figure()
@@ -187,7 +214,8 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (errors,),
         fit.warnings,
-        plain(fit, "s2r", "held_out") | {"n_unsettled": n_unsettled},
+        plain(fit, "s2r", "held_out")
+        | {"n_unsettled": n_unsettled, "others": [plain(other, "s2r", "held_out") for other in others]},
         (("held-out poses with and without the network", figure),),
     )
 
@@ -200,7 +228,7 @@ def with_pressures(
     Args:
         section: section of the network.
         held: fitted residual pressures.
-        widths_kg: how well payloads are told, see `calib.fit.payload.told_widths`.
+        widths_kg: accuracy of payloads, see `calib.fit.payload.payload_intervals`.
         known_kg: half-width beyond which the control loop does not believe a payload.
     """
     text = (
@@ -211,19 +239,186 @@ def with_pressures(
     )
     figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
     figures["hysteresis"] = float(held.held.hysteresis_kpa.max())
-    # Tell how well payloads will be known.
+    # The accuracy of payloads.
     none_g, largest_g = (1e3 * kg for kg in widths_kg)
     text += (
-        f" So the loop will tell within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
+        f" So the loop will know within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
         f"the workspace's poses, and the largest payload within {largest_g:.0f} g at 95 % of them."
     )
     widths = {"none, median": none_g, "largest, p95": largest_g}
     data = {"held_pressures_rms_kpa": figures, "payload_half_width_g": widths}
     warnings = section.warnings
     if largest_g > 1e3 * known_kg:
-        told = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
-        warnings += (f"{told}: record more random poses",)
+        accuracy = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
+        warnings += (f"{accuracy}: record more random poses",)
     return dataclasses.replace(section, text=section.text + text, warnings=warnings, data=section.data | data)
+
+
+def actuators(fit: ActuatorFit) -> Section:
+    """Show the numbers of the actuators and the errors of the pressures."""
+    # A row for each chamber: its numbers, with intervals where they were fitted, and its error
+    found, n = fit.spec.actuators, fit.spec.n_chambers
+    each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(found).items()}
+    widths = fit.half_width_95 if isinstance(found, Regulator) else {}
+    rows = []
+    for k in range(n):
+        pairs = ((value[k], widths[name][k]) if widths else (value[k],) for name, value in each.items())
+        numbers = [x for pair in pairs for x in pair]
+        rows.append((f"chamber {k}", *map(float, [*numbers, fit.chamber_rms_kpa[k]])))
+    titles = [text for name in each for text in ((name, "+-") if widths else (name,))]
+
+    # Errors of each kind of actuator, then the section
+    errors = (
+        ("held-out seconds, command taken for the pressure", fit.held_out_rms_kpa["command"]),
+        ("held-out seconds, before", fit.held_out_rms_kpa["specification"]),
+        ("held-out seconds, pump", fit.held_out_rms_kpa["pump"]),
+        ("held-out seconds, regulator", fit.held_out_rms_kpa["regulator"]),
+        (f"seconds of the fit, {fit.chosen}", fit.in_sample_rms_kpa),
+    )
+    return Section(
+        "Actuators",
+        f"{fit.n_tracks} tracks of commanded and measured pressures, {fit.time_s:.0f} s in all: "
+        f"{found.kind}s driven with the commands against the measured pressures. Intervals are 95 %. "
+        f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s). {_kept(fit)}",
+        (
+            ReportTable(("", *titles, "held-out RMS [kPa]"), tuple(rows)),
+            ReportTable(("pressures", "RMS [kPa]"), errors),
+        ),
+        fit.warnings,
+        plain(fit, "spec", "notes") | {"kind": found.kind, "values": as_json(dataclasses.asdict(found))},
+        notes=fit.notes,
+    )
+
+
+def _kept(fit: ActuatorFit) -> str:
+    """Say why these actuators are kept."""
+    better = f"better by more than {100 * (MARGIN - 1):.0f} % and {SMALL_KPA:g} kPa"
+    if fit.chosen == "regulator":
+        return f"The regulator is kept, since at held-out seconds it is {better}."
+    kept = "pump" if fit.chosen == "pump" else "specification's actuators"
+    text = f"Kept: the {kept}. At held-out seconds nothing else that was fitted is {better}."
+    if fit.held_out_rms_kpa["command"] < fit.held_out_rms_kpa[fit.chosen]:
+        text += " The command itself is closer: the actuators are quicker than this log can show. It is no "
+        text += "actuator, and stands for comparison."
+    return text
+
+
+def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
+    """Show damping of chambers and backbone, the lag of the shape, and the errors of the moving tip."""
+    values = {
+        "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
+        "bending_damping_nms_per_rad": fit.spec.backbone.bending_damping_nms_per_rad,
+    }
+    rows = [row for name in values for row in per_part(name, values[name], fit.half_width_95[name])]
+    errors = (
+        ("held-out seconds, before", fit.held_out_before_rms_mm),
+        ("held-out seconds, calibrated", fit.held_out_rms_mm),
+        ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
+    )
+    tables = [ReportTable(("", "value", "+-"), tuple(rows)), ReportTable(("tip", "RMS [mm]"), errors)]
+    # The shape's lag, where it could be fitted
+    warnings, lag = fit.warnings, {}
+    if shape is not None:
+        width = shape.half_width_s if np.isfinite(shape.half_width_s) else "not known"
+        fitted = "fitted", shape.lag_s, width, shape.rms_mm
+        lags = ("before", shape.before_s, "", shape.before_rms_mm), fitted
+        tables.append(ReportTable(("lag of the shape behind the springs", "s", "+-", "tip, RMS [mm]"), lags))
+        lag = plain(shape, "spec") | {"half_width_s": as_json(shape.half_width_s)}
+    if shape is not None and shape.at_end:
+        warnings += (
+            f"the best lag of the shape, {shape.lag_s:.2g} s, is an end of those tried, and is not used: log "
+            "quicker motion, or check that times of springs and tip agree",
+        )
+    return Section(
+        "Damping",
+        f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
+        "measured pressures against the measured tip. Intervals are 95 %.",
+        tuple(tables),
+        warnings,
+        plain(fit, "spec") | {"values": values, "shape": lag or None},
+    )
+
+
+def changes(found: Changes, known_mm: float) -> Section:
+    """Show what has changed, and whether that explains the later poses.
+
+    Args:
+        found: fitted changes.
+        known_mm: mean error of the tip at held-out poses of the calibration, 0 if not known.
+    """
+    # Tables of the springs, the chambers and the errors
+    springs = _rows("spring", 1e3 * found.zero_m, 1e3 * found.zero_half_width_m)
+    chambers = _rows("chamber", 100 * found.stiffness, found.offset_kpa)
+    errors = tuple(
+        (what, tip.translation_mean_mm, tip.rotation_mean_deg, kpa)
+        if tip.n
+        else (what, "not measured", "not measured", kpa)
+        for what, tip, kpa in (
+            ("before", found.before, found.before_kpa),
+            ("with the changes", found.after, found.after_kpa),
+        )
+    )
+    tables = (
+        ReportTable(("", "zero [mm]", "+-"), springs),
+        ReportTable(("", "stiffness [%]", "pressure [kPa]"), chambers),
+        ReportTable(("held-out poses", "tip [mm]", "turn [deg]", "pressures, RMS [kPa]"), errors),
+    )
+
+    # A sentence for the terminal, and a warning where more has changed
+    warnings: tuple[str, ...] = ()
+    after_mm = found.after.translation_mean_mm if found.is_better else found.before.translation_mean_mm
+    if known_mm and after_mm > ENOUGH * known_mm:
+        warnings = (
+            f"{after_mm:.1f} mm remain at held-out poses, {known_mm:.1f} mm at the calibration: more has "
+            "changed than zeros and stiffness, so record poses anew and calibrate",
+        )
+    return Section(
+        CHANGES,
+        f"{found.n} later poses of the unloaded arm against the calibrated simulation. Zeros are true "
+        "lengths minus lengths read. A stiffness and an offset of the pressures differ to some per cent. "
+        "Intervals are 95 %; contiguous blocks of poses are held out.",
+        tables,
+        warnings,
+        plain(found, "spec") | {"is_better": found.is_better},
+        notes=(_sentence(found),),
+    )
+
+
+def payloads(found: PayloadScaleFit) -> Section:
+    """Show how strongly the arm feels payloads, by poses with a known weight."""
+    estimate = f"{found.n} poses with a known weight gave {found.ratio:.3f} of it in the mean"
+    if not found.is_plausible:
+        expected = f"expected {1.0 - MOST_OFF:.1f} to {1.0 + MOST_OFF:.1f}"
+        remedy = "check the weight and its unit, and whether the arm has changed since the calibration"
+        warning = f"{estimate}, {expected}: {remedy}"
+        return Section(PAYLOADS, f"{estimate}.", warnings=(warning,), data=found._asdict())
+    percent = 100.0 * QUANTILE * found.factor_sd
+    text = (
+        f"{estimate}. So a payload changes the pressures by {found.factor:.3f} of the simulated change. Near "
+        f"these poses this factor is known to {percent:.0f} % (95 %); other errors add to it."
+    )
+    off = 100.0 * (found.ratio - 1.0)
+    note = (
+        f"payloads were estimated {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
+    )
+    return Section(PAYLOADS, text, data=found._asdict(), notes=(note,))
+
+
+def _rows(name: str, *columns: np.ndarray) -> tuple[tuple[Any, ...], ...]:
+    return tuple((f"{name} {k}", *map(float, row)) for k, row in enumerate(zip(*columns, strict=True)))
+
+
+def _sentence(found: Changes) -> str:
+    if not found.is_better:
+        return "nothing has changed that these poses show: the calibration stays as it is"
+    zero_mm = ", ".join(f"{x:+.1f}" for x in 1e3 * found.zero_m)
+    mean, half = 100 * found.stiffness.mean(), 100 * found.mean_half_width
+    what = f"zeros of the springs {zero_mm} mm; stiffness of the chambers {mean:+.0f} +- {half:.0f} %"
+    if not found.before.n:  # no motion capture
+        off = f"{found.before_kpa:.2f} kPa off before, {found.after_kpa:.2f} now"
+        return f"{what}; pressures at held-out poses {off}"
+    before_mm, after_mm = found.before.translation_mean_mm, found.after.translation_mean_mm
+    return f"{what}; tips at held-out poses {before_mm:.1f} mm off before, {after_mm:.1f} mm now"
 
 
 def _errors(*rows: tuple[str, PoseErrors]) -> ReportTable:

@@ -23,9 +23,10 @@ class Schedule(NamedTuple):
     """Course of a training by Adam."""
 
     n_updates: int
-    learning_rate: float  # first rate, which falls to zero along a half cosine
+    learning_rate: float  # first rate, which falls along a half cosine
     batch_size: int
     weight_decay: float = 0.0  # per update and learning rate
+    last_share: float = 0.0  # last learning rate over the first
 
 
 def initial_layers(key: Array, widths: Sequence[int]) -> tuple[Layer, ...]:
@@ -67,7 +68,7 @@ def train_network(
     batch_size = min(schedule.batch_size, n_learned)
     n_batches = n_learned // batch_size
     n_epochs = -(-schedule.n_updates // n_batches)
-    decay = optax.cosine_decay_schedule(schedule.learning_rate, n_epochs * n_batches)
+    decay = optax.cosine_decay_schedule(schedule.learning_rate, n_epochs * n_batches, schedule.last_share)
     optimiser = optax.adamw(decay, weight_decay=schedule.weight_decay)
 
     def run(weights: Weights, keys: Array, learned: Any, stopping: Any) -> tuple[Weights, Array]:

@@ -158,7 +158,7 @@ def backbone(
 ) -> Frame:
     """Return frames along the arm, which ends at the tip's pose. NumPy only.
 
-    Sections of constant curvature are in series, as the springs tell. The tip's distance from their end is
+    Sections of constant curvature are in series, by the springs. The tip's distance from their end is
     spread over the arm: it grows evenly from the base.
 
     Args:

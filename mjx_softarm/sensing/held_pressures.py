@@ -10,13 +10,13 @@ standardised. With the covariance V (c, c) between chambers,
 The pressures are those without the chambers' hysteresis (`mjx_softarm.sensing.hysteresis`), which depends on
 the way to a pose, not on the pose.
 
-A payload is told from pressures: about 4 kPa of the paper's arm for each kilogram. The mean of the process
-corrects them. Its variance tells how well a payload is known: it is large far from the poses of the log.
+A payload shows in pressures: about 4 kPa of the paper's arm for each kilogram. The mean of the process
+corrects them. Its variance is the accuracy of a payload: it is large far from the poses of the log.
 
 A payload changes a chamber's pressure by the simulated change times a factor. The log of an unloaded arm does
 not show this factor: with all stiffnesses, areas and masses greater by the same share, the log is the same.
 So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`, or about
-what poses with a known weight have told (`calib.fit.payload.weighed`).
+what poses with a known weight have shown (`calib.fit.payload.fit_payload_scale`).
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """

@@ -1,7 +1,7 @@
 """Payload of an arm at rest, estimated from springs and pressures, and averaged. NumPy and JAX.
 
 A payload bends and stretches the arm, and the sensor-space law holds the springs where they were. So springs
-alone do not show a payload; springs and pressures do. A small network tells what springs say: the pressures
+alone do not show a payload; springs and pressures do. A small network predicts from springs: the pressures
 p(l) that hold them without a payload, their change e(l) by a payload, and how well the calibration knows
 p(l). It is distilled from simulated equilibria. The payload m follows by generalised least squares from the
 pressures p that are measured, section by section:
@@ -41,7 +41,7 @@ KNOWN = 0.3  # greatest half-width, in largest payloads, of a 95 % interval that
 # Payloads in the network's data, as shares of the largest one: an interval outside holds no payload.
 LOWEST, HIGHEST = -0.5, 1.5
 # Standard deviations of the factors by which the simulated change is off. The first is of all chambers
-# together, by masses and areas that are off by some per cent, until a known weight tells. The second is of
+# together, by masses and areas that are off by some per cent, until a known weight shows it. The second is of
 # each chamber at each pose. Rods 100 to 104, which no experiment uses, have a little less: 0.04 and 0.08.
 COMMON_FACTOR, OWN_FACTOR = 0.05, 0.09
 N_PASSES = 2  # number of estimates; each takes D of the last
@@ -101,7 +101,7 @@ class Load(NamedTuple):
 
 
 def holding(estimator: LoadEstimator, spring_m: Array) -> Holding:
-    """Return what springs (..., n_springs) [m] tell of the pressures that hold them."""
+    """Predict the pressures that hold springs (..., n_springs) [m]."""
     xp = array_namespace(spring_m, estimator.slope)
     spring_m = xp.asarray(spring_m, dtype=estimator.slope.dtype)
     springs = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m

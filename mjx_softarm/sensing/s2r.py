@@ -6,7 +6,7 @@ the angle): both are smooth at pitch 90, where yaw and roll are not.
 
 Training in simulation visits arms far from the logged ones. The network must not diverge there, so its inputs
 are clipped to the range of the training rows and its outputs to the range of their corrections.
-`extrapolation` tells how far away such an arm is.
+`extrapolation` measures how far away such an arm is.
 
 Source: Sim-to-Real Transfer in Meng et al., N_S2R: (P, L_spring) -> P_S2R.
 """

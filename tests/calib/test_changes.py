@@ -10,7 +10,7 @@ from calib.arm import CalibratedArm
 from calib.changes import fit_changes
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
-from calib.report.changes import CHANGES, changes_section
+from calib.report import sections
 from calib.report.page import to_html, to_json
 from calib.steps import changes
 from mjx_softarm.mechanics.excitation import random_pressures
@@ -60,13 +60,13 @@ def test_shifted_zeros_and_softer_chambers_are_found(aged, spec):
 
 
 def test_the_report_says_what_has_changed(aged):
-    section = changes_section(aged, known_mm=0.3)
-    assert not section.warnings and section.title == CHANGES
+    section = sections.changes(aged, known_mm=0.3)
+    assert not section.warnings and section.title == sections.CHANGES
     zeros = (
         r"zeros of the springs \+0\.8, \+1\.0, -1\.0, .* mm; stiffness of the chambers -5 \+- [0-9]+ %; tips"
     )
     assert re.match(zeros, section.notes[0]), section.notes
-    [warning] = changes_section(aged, known_mm=0.01).warnings
+    [warning] = sections.changes(aged, known_mm=0.01).warnings
     assert "more has changed than zeros and stiffness, so record poses anew" in warning
 
 
@@ -76,10 +76,10 @@ def test_without_motion_capture_the_pressures_show_softer_chambers(spec):
     found = fit_changes(CalibratedArm(spec), unseen)
     assert found.is_better and found.before.n == 0
     assert found.stiffness.mean() == pytest.approx(SOFTER - 1.0, abs=0.015)
-    section = changes_section(found, known_mm=0.3)
+    section = sections.changes(found, known_mm=0.3)
     assert re.search(r"pressures at held-out poses [0-9.]+ kPa off before, [0-9.]+ now$", section.notes[0])
     report = json.loads(json.dumps(to_json([section], [], {}), allow_nan=False))
-    figures = report["parts"][CHANGES]["figures"]
+    figures = report["parts"][sections.CHANGES]["figures"]
     assert figures["before"]["translation_mean_mm"] is None and figures["is_better"]
     np.testing.assert_array_equal(figures["zero_m"], found.zero_m)
     assert "nan" not in to_html("paper", [section], [], {})
@@ -88,11 +88,11 @@ def test_without_motion_capture_the_pressures_show_softer_chambers(spec):
 def test_an_arm_that_has_not_changed_keeps_its_calibration(spec):
     measurements = Measurements((), poses_of(spec), {})
     result = changes(measurements, CalibratedArm(spec), 0)
-    assert np.abs(result.spec.spring_sensor.delta_m - spec.spring_sensor.delta_m).max() < 1e-4
+    assert np.abs(result.arm.spec.spring_sensor.delta_m - spec.spring_sensor.delta_m).max() < 1e-4
 
 
 def test_poses_with_a_payload_do_not_count(spec):
     loaded = Measurements((), poses_of(spec, payload_kg=0.5), {"used": 24})
     result = changes(loaded, CalibratedArm(spec), 0)
-    assert result.spec == spec and "measure 8 goals or more" in result.section.warnings[0]
+    assert result.arm.spec == spec and "measure 8 goals or more" in result.section.warnings[0]
     assert "Got 0 poses at rest" in result.section.text

@@ -14,6 +14,8 @@ from calib.demo import planted_arm, write_demo
 from calib.fit import network
 from calib.fit.payload import held_at
 from calib.read.logs import read_log
+from calib.read.measurements import measure
+from calib.steps import s2r_errors
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.pose_pairs import read_pose_pairs
 from mjx_softarm.logs.schema import write_log
@@ -86,6 +88,18 @@ def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated)
     assert corrected["rotation_mean_deg"] < 0.8 * simulated["rotation_mean_deg"]
 
 
+def test_the_paper_s_network_is_judged_at_the_poses_of_the_report(demo, calibrated):
+    arm = CalibratedArm.read(calibrated[1])
+    errors = s2r_errors(measure([read_log(demo[1], arm.spec)[0]], arm.spec), arm)
+    report = json.loads((calibrated[1] / "report.json").read_text())
+    figures = report["parts"]["Sim-to-real network"]["figures"]
+    for name, key in (("calibrated", "test"), ("simulated", "test_uncorrected")):
+        expected = figures[key]["translation_mean_mm"]
+        assert errors[name].translation_mean_mm == pytest.approx(expected, rel=1e-3)
+    assert errors["as printed"].n == errors["calibrated"].n
+    assert errors["as printed"].translation_mean_mm > errors["calibrated"].translation_mean_mm
+
+
 def test_a_calibration_goes_on_with_a_later_log(demo, calibrated, tmp_path, capsys):
     """Later, two springs read 1.5 mm less; the rest of the folder stays."""
     before, later, out = calibrated[1], tmp_path / "later.npz", tmp_path / "new"
@@ -124,7 +138,7 @@ def test_a_known_weight_tells_how_payloads_are_felt(demo, calibrated, tmp_path, 
     assert found.spec == arm.spec
     if not why:
         assert found.held.factor == pytest.approx(0.9, abs=0.03) and found.held.factor_sd < 0.04
-        assert "note: Payloads: payloads were told 1" in said.out and "% too light" in said.out
+        assert "note: Payloads: payloads were estimated 1" in said.out and "% too light" in said.out
         assert "next: python -m train export RUN --calibration" in said.out
     else:
         assert found.held.factor == 1.0 and status == 1 and why in said.out
@@ -142,9 +156,9 @@ def test_a_later_log_that_shows_no_change_names_no_export(demo, calibrated, tmp_
     assert (out / "arm.toml").read_bytes() == (calibrated[1] / "arm.toml").read_bytes()
 
 
-@pytest.mark.parametrize("option", ["--spec", "--shared-springs", "--fit-compensation"])
+@pytest.mark.parametrize("option", ["--spec", "--shared-springs", "--fit-compensation", "--s2r"])
 def test_options_that_a_later_log_does_not_have_are_refused(option, tmp_path, capsys):
-    value = ["paper"] if option == "--spec" else []
+    value = {"--spec": ["paper"], "--s2r": ["printed"]}.get(option, [])
     words = ["run", "later.npz", "--since", "before", option, *value, "--out", str(tmp_path / "other")]
     assert main(words) == 2
     said = capsys.readouterr().err

@@ -21,7 +21,6 @@ import numpy as np
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import (
     NOT_CONVERGED,
-    QUANTILE,
     Model,
     Problem,
     Solution,
@@ -31,6 +30,7 @@ from calib.fit.leastsquares import (
 )
 from calib.fit.motion.tracks import Runs, Track
 from mjx_softarm.pneumatics import LONGEST_DELAY_S, PAPER_PUMP, Actuators, Pump, Regulator
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.spec import ArmSpec
 
 BLOCK_S = 10  # clusters of a held-out block: a whole transient

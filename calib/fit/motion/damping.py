@@ -20,7 +20,7 @@ import numpy as np
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
-from calib.fit.motion.parts import clusters, dense_parts
+from calib.fit.motion.tracks import clusters, dense_parts
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import PerSection, scaled
 from mjx_softarm.logs.rest import HOLD_KPA

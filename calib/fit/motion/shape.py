@@ -21,13 +21,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.fit.leastsquares import QUANTILE
-from calib.fit.motion.parts import dense_parts
+from calib.fit.motion.tracks import dense_parts
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.fields import scaled
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.estimator import Frame, even_pose
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.spec import ArmSpec
 
 MIN_S = 10.0  # length of a part of a log

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from calib.arm import CalibratedArm
 from calib.fit.motion.actuators import fit_actuators, with_actuators
 from calib.fit.motion.tracks import find_tracks
 from calib.read.measurements import measure
-from calib.report import motion
+from calib.report import sections
 from calib.steps import actuators
 from mjx_softarm.deploy.record import record
 from mjx_softarm.logs.schema import Log
@@ -101,9 +102,9 @@ def test_the_specification_s_pump_stays_where_it_fits(short):
     fit = fit_actuators(find_tracks([log_of(short, short.actuators)], short), short)
     assert fit.chosen == "specification" and fit.spec == short
     assert fit.held_out_rms_kpa["specification"] < 0.5 < fit.held_out_rms_kpa["command"]
-    assert "Kept: the specification's actuators" in motion.actuators(fit).text
+    assert "Kept: the specification's actuators" in sections.actuators(fit).text
     closer = dict(fit.held_out_rms_kpa, command=0.0)
-    quick = motion.actuators(dataclasses.replace(fit, held_out_rms_kpa=closer)).text
+    quick = sections.actuators(dataclasses.replace(fit, held_out_rms_kpa=closer)).text
     assert "The command itself is closer" in quick
 
 
@@ -123,7 +124,7 @@ def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
     for name, tolerance in (("lag_s", 0.12), ("dead_time_s", 0.03)):
         np.testing.assert_allclose(getattr(fit.spec.actuators, name), getattr(true, name), atol=tolerance)
     assert not fit.warnings and "fill_kpa_per_s is known to" in fit.notes[0]
-    section = actuators(measure([log], spec), spec, 0).section
+    section = actuators(measure([log], spec), CalibratedArm(spec), 0).section
     assert section.notes == fit.notes and "The regulator is kept" in section.text
 
 
@@ -131,5 +132,5 @@ def test_a_log_without_commands_or_of_poses_alone_says_so(short):
     log = log_of(short, short.actuators)
     rows = np.arange(0, len(log), 50)
     for unfit in (dataclasses.replace(log, commanded_kpa=None), log.take(rows)):
-        spec, section, _ = actuators(measure([unfit], short), short, 0)
-        assert spec == short and "No log has commanded and measured pressures" in section.text
+        arm, section, _ = actuators(measure([unfit], short), CalibratedArm(short), 0)
+        assert arm.spec == short and "No log has commanded and measured pressures" in section.text

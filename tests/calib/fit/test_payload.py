@@ -5,7 +5,7 @@ import pytest
 
 from calib.arm import CalibratedArm
 from calib.fit.held_pressures import fit_held_pressures, hysteresis_kpa
-from calib.fit.payload import held_at, payload_poses, told_payload, weighed
+from calib.fit.payload import estimated_payload, fit_payload_scale, held_at, payload_poses
 from calib.read.static_poses import StaticPoses
 from mjx_softarm import ArmSpec
 from mjx_softarm.sensing.held_pressures import held_kpa
@@ -64,12 +64,12 @@ def poses_with(arm, factor, weight_kg, n, seed):
 
 def told(arm, poses):
     kpa = poses.pressure_kpa - hysteresis_kpa(arm.spec, arm.held, poses.spring_m)
-    return told_payload(arm, poses.spring_m, kpa - arm.spec.unmodelled_kpa)
+    return estimated_payload(arm, poses.spring_m, kpa - arm.spec.unmodelled_kpa)
 
 
 def test_poses_with_a_known_weight_tell_the_factor_of_all_payloads(arm):
     poses = poses_with(arm, 0.9, 0.5, 20, 3)
-    found = weighed(arm, poses, np.arange(20))
+    found = fit_payload_scale(arm, poses, np.arange(20))
     assert found.is_plausible and found.factor == pytest.approx(0.9, abs=0.02)
     assert found.factor_sd < 0.7 * COMMON_FACTOR
     # Another payload at other poses, told within intervals that are narrower
@@ -79,7 +79,7 @@ def test_poses_with_a_known_weight_tell_the_factor_of_all_payloads(arm):
     assert before_kg.mean() == pytest.approx(0.9, abs=0.03)
     assert then_kg.mean() == pytest.approx(1.0, abs=0.03) and then.mean() < 0.9 * before.mean()
     # The same weight again is told rightly, and changes little
-    again = weighed(known, poses, np.arange(20))
+    again = fit_payload_scale(known, poses, np.arange(20))
     assert again.ratio == pytest.approx(1.0, abs=0.02)
     assert again.factor == pytest.approx(found.factor, abs=0.01)
 
@@ -88,12 +88,12 @@ def test_hysteresis_that_the_way_shows_is_no_weight(arm):
     """Poses of the way between the heavy ones count: without hysteresis the ratio is farther off."""
     without = arm._replace(held=arm.held._replace(hysteresis_kpa=np.zeros(3)))
     poses, rows = poses_with(arm, 1.0, 0.25, 40, 3), np.arange(0, 40, 4)
-    ratio, off = (weighed(x, poses, rows).ratio for x in (arm, without))
+    ratio, off = (fit_payload_scale(x, poses, rows).ratio for x in (arm, without))
     assert abs(ratio - 1.0) < 0.05 and abs(off - 1.0) > 2.0 * abs(ratio - 1.0)
 
 
 def test_a_weight_that_is_hardly_felt_tells_little_and_leaves_the_interval(arm):
-    found = weighed(arm, poses_with(arm, 0.9, 0.01, 40, 3), np.arange(40))
+    found = fit_payload_scale(arm, poses_with(arm, 0.9, 0.01, 40, 3), np.arange(40))
     assert 0.8 * COMMON_FACTOR < found.factor_sd < COMMON_FACTOR
     assert found.factor == pytest.approx(1.0, abs=0.05)
 
@@ -101,7 +101,7 @@ def test_a_weight_that_is_hardly_felt_tells_little_and_leaves_the_interval(arm):
 @pytest.mark.parametrize("weight_kg", [0.25, 5.0])
 def test_a_weight_that_is_not_the_log_s_is_not_plausible(arm, weight_kg):
     poses = poses_with(arm, 1.0, 0.5, 20, 3)._replace(payload_kg=np.full(20, weight_kg))
-    assert not weighed(arm, poses, np.arange(20)).is_plausible
+    assert not fit_payload_scale(arm, poses, np.arange(20)).is_plausible
 
 
 def test_redundant_pressures_are_no_weight(four_chamber_arm):
@@ -112,5 +112,5 @@ def test_redundant_pressures_are_no_weight(four_chamber_arm):
     kpa = at.pressure_kpa + 0.5 * at.effect_kpa_per_kg + 5.0 * np.tile([1.0, -1.0], n // 2)
     m, none = len(kpa), np.empty(0)
     poses = StaticPoses(kpa, np.full(m, 0.5), none, none, at.spring_m, none, none, np.ones(m))
-    found = weighed(CalibratedArm(four_chamber_arm, held=fit.held), poses, np.arange(m))
+    found = fit_payload_scale(CalibratedArm(four_chamber_arm, held=fit.held), poses, np.arange(m))
     assert found.ratio == pytest.approx(1.0, abs=0.05)

@@ -11,12 +11,12 @@ from benchmarks.accuracy.calibration import trunk_errors
 from calib.fit.blocks import held_out_blocks
 from calib.fit.network import OF_ROWS, NetworkConfig, fit_network
 from calib.fit.pose_errors import pose_errors
-from calib.fit.s2r import fit_s2r, simulate_poses
+from calib.fit.s2r import PRINTED_NETWORK, PROCESS, fit_printed, fit_s2r, moved, simulate_poses
+from calib.report import sections
 from mjx_softarm._support.training import Schedule
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import sample_workspace
-from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
-from mjx_softarm.sensing.s2r import apply_correction, correct, correction, extrapolation
+from mjx_softarm.sensing.s2r import correct, correction, extrapolation
 
 N_ROWS, N_CLEAN = 1_000, 500
 BRIEF = NetworkConfig((16,), Schedule(100, 0.01, 128))
@@ -28,10 +28,6 @@ def measured(pose, rng, noise_mm=0.5, noise_deg=0.3):
     """Poses as motion capture would measure them."""
     turn = rng.normal(0.0, 0.5 * np.deg2rad(noise_deg), (len(pose), 3))
     return moved(pose, np.concatenate([rng.normal(0.0, noise_mm, (len(pose), 3)), turn], axis=1))
-
-
-def moved(pose, change):
-    return pose_from_frame(*apply_correction(frame_from_pose(pose), change))
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +104,33 @@ def test_reported_error_is_that_of_the_held_out_rows(arms, fit):
     assert fit.test.translation_mean_mm == pytest.approx(error_mm.mean(), rel=1e-6)
     assert fit.test.translation_95_mm == pytest.approx(np.percentile(error_mm, 95.0), rel=1e-6)
     assert 0.15 < fit.held_out.mean() < 0.25
+
+
+def test_the_paper_s_network_gives_the_pose_itself_and_is_judged_by_the_same_rows(spec, arms, fit):
+    """It learns all of the pose from few rows; the process knows the simulation, and learns its error."""
+    real = measured(arms[1][:N_ROWS], np.random.default_rng(2))
+    printed = fit_s2r(spec, first(arms, N_ROWS), real, config=BRIEF, printed=True)
+    np.testing.assert_array_equal(printed.held_out, fit.held_out)
+    assert printed.test_uncorrected == fit.test_uncorrected
+    assert fit.test_model.translation_mean_mm < printed.test_model.translation_mean_mm < 20.0
+    # The report shows both
+    rows = first(arms, N_ROWS)
+    section = sections.s2r(printed, rows.pose, rows.spring_m, real, 0, (fit,))
+    shown = {row[0].removeprefix("held-out poses, "): row[2] for row in section.tables[0].rows}
+    assert shown[PRINTED_NETWORK] == printed.test_model.translation_mean_mm
+    assert shown[PROCESS] == fit.test_model.translation_mean_mm
+
+
+def test_the_paper_s_network_learns_angles_that_jump(arms):
+    """Yaws about 170 degrees, turned by 20."""
+    pose = arms[0].pose[:600] * [1, 1, 1, 0.1, 1, 1] + [0, 0, 0, 170, 0, 0]
+    rows = arms[0].take(np.arange(600))._replace(pose=pose)
+    real = pose + [3, 0, -2, 20, 0, 1]
+    assert real[:, 3].min() > 180.0 - 20.0
+    real[:, 3] = (real[:, 3] + 180.0) % 360.0 - 180.0
+    model = fit_printed(rows.take(np.arange(500)), real[:500])
+    others = rows.take(np.arange(500, 600))
+    assert pose_errors(moved(others.pose, model(others)), real[500:]).rotation_mean_deg < 6.0
 
 
 def test_states_far_from_the_log_are_flagged_and_stay_bounded(spec, arms, fit):

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from calib import steps
-from calib.fit.leastsquares import QUANTILE
+from calib.arm import CalibratedArm
 from calib.fit.motion import shape
 from calib.fit.motion.damping import DampingFit
 from calib.fit.motion.shape import fit_shape
 from calib.read.measurements import Measurements
-from calib.report import motion
+from calib.report import sections
 from calib.report.page import to_json
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.record import record
 from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import Build
 
@@ -94,14 +95,14 @@ def test_a_lag_beyond_those_tried_is_not_believed(quick, monkeypatch):
     found = fit_shape([quick], SPEC)
     assert found.at_end and not found.is_better and found.log_std == np.inf
     assert found.rms_mm < 0.98 * found.before_rms_mm
-    section = motion.damping(DAMPING, found)
+    section = sections.damping(DAMPING, found)
     assert "the best lag of the shape, 0.31 s, is an end of those tried" in section.warnings[-1]
     assert to_json([section], [], {})["parts"]["Damping"]["figures"]["shape"]["log_std"] is None
 
 
 def test_the_report_tells_the_lag_s_own_interval(quick):
     found = fit_shape([quick], SPEC)
-    section = motion.damping(DAMPING, found)
+    section = sections.damping(DAMPING, found)
     [before, fitted] = section.tables[-1].rows
     assert fitted == ("fitted", found.lag_s, QUANTILE * found.log_std * found.lag_s, found.rms_mm)
     assert before[2] == "" and section.warnings == DAMPING.warnings
@@ -115,6 +116,6 @@ def test_the_damping_fit_has_the_interval_of_the_lag_as_its_prior(quick, monkeyp
         return dataclasses.replace(DAMPING, spec=spec)
 
     monkeypatch.setattr(steps, "fit_damping", fit)
-    steps.damping(Measurements((quick,), None, {}), SPEC, 0)
+    steps.damping(Measurements((quick,), None, {}), CalibratedArm(SPEC), 0)
     found = fit_shape([quick], SPEC)
     assert asked == [(pytest.approx(found.lag_s), found.log_std)]

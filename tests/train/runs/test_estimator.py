@@ -7,7 +7,7 @@ import pytest
 
 from calib.arm import CalibratedArm
 from calib.fit.held_pressures import fit_held_pressures
-from calib.fit.payload import told_payload
+from calib.fit.payload import estimated_payload
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import TOLERANCE_M, Gains, saturated
 from mjx_softarm.deploy.belief import explained_by_pressure_loss
@@ -173,6 +173,6 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
         ).swapaxes(0, 1)
         off_kg = np.abs(told_kg - payload_kg)
         assert np.median(off_kg[1]) < 0.08 and np.median(off_kg[0]) > 1.5 * np.median(off_kg[1])
-        exact_kg, _ = told_payload(arm, arms.spring_m, kpa - spec.unmodelled_kpa)
+        exact_kg, _ = estimated_payload(arm, arms.spring_m, kpa - spec.unmodelled_kpa)
         assert np.sqrt(np.mean((told_kg[1] - exact_kg) ** 2)) < 0.03  # 0.003 after all of the training
         assert np.mean(off_kg[1] < half_width_kg[1]) > 0.9 and np.median(half_width_kg[1]) < 0.3
