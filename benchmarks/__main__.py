@@ -19,14 +19,11 @@ BENCHMARKS = {
     "gpu": "benchmarks.speed.gpu:measure",
     "settle": "benchmarks.speed.settle:measure",
     "guard": "benchmarks.speed.guard:main",
-    "calibration": "benchmarks.calibration.calibration:measure",
-    "arms": "benchmarks.accuracy.arms:measure",
-    "logs": "benchmarks.calibration.logs:measure",
-    "claims": "benchmarks.accuracy.claims:measure",
     "race": "benchmarks.race.race:race",
+    "calibration": "benchmarks.accuracy.calibration:measure",
+    "arms": "benchmarks.accuracy.arms:measure",
     "printed": "benchmarks.accuracy.printed:measure",
     "paper": "benchmarks.paper.experiments:Paper",
-    "traces": "benchmarks.paper.traces:measure",
 }
 
 

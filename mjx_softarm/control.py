@@ -80,7 +80,9 @@ def chambers_of_springs(spec: ArmSpec) -> np.ndarray:
 
     A chamber's length is that of the plane through its section's springs, at the chamber's own radius.
     """
-    c, s, blocks = spec.structure.chambers_per_section, spec.springs_per_section, []
+    c = spec.structure.chambers_per_section
+    s = spec.springs_per_section
+    blocks = []
     radii = map(spec.per_section, (spec.geometry.chamber_radius_m, spec.geometry.spring_radius_m))
     for section, (chamber, spring) in enumerate(zip(*radii, strict=True)):
         rows = np.zeros((c, spec.n_springs))

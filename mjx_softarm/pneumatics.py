@@ -178,7 +178,8 @@ class Pneumatics:
             actuators: pumps or regulators.
         """
         self._bellows = area_m2, slope_m, rest_m
-        self._timestep_s, self._actuators = timestep_s, actuators
+        self._timestep_s = timestep_s
+        self._actuators = actuators
         self._chamber = np.arange(len(length_m))
         delay_s = np.full(len(length_m), actuators.delay_s)
         self._wait = np.round(delay_s / timestep_s).astype(int)  # (n,) steps
@@ -204,7 +205,8 @@ class Pneumatics:
         """Take a time step at lengths (n,) [m]; return pressures (n,) [kPa], relative to the atmosphere."""
         self._line[1:] = self._line[:-1]
         self._line[0] = self._commanded_kpa
-        volume, command_kpa = self.volume_m3(length_m), self._line[self._wait, self._chamber]
+        volume = self.volume_m3(length_m)
+        command_kpa = self._line[self._wait, self._chamber]
         self._gas_m3 = self._actuators.fill(self._gas_m3, volume, command_kpa, self._timestep_s)
         self.pressure_kpa = pressure_of(self._gas_m3, volume)
         return self.pressure_kpa

@@ -239,7 +239,8 @@ class ArmSpec:
     def pneumatics(self, length_m: np.ndarray, timestep_s: float) -> Pneumatics:
         """Return the air of chambers with lengths (n_chambers,) [m] at the start, stepped by `timestep_s`."""
         area_m2, slope_m = map(self.per_chamber, (self.chambers.area_m2, self.chambers.area_slope_m))
-        rest_m, actuators = self.at_chambers(self.geometry.section_length_m), self.actuators
+        rest_m = self.at_chambers(self.geometry.section_length_m)
+        actuators = self.actuators
         bellows = np.array(area_m2), np.array(slope_m), rest_m
         return Pneumatics(*bellows, length_m, timestep_s, actuators.per_chamber(self.n_chambers))
 
@@ -262,7 +263,8 @@ class ArmSpec:
     @property
     def section_mass_kg(self) -> tuple[float, ...]:
         """Own mass of each section."""
-        n, arm_kg = self.structure.n_sections, self.mass.arm_kg
+        n = self.structure.n_sections
+        arm_kg = self.mass.arm_kg
         return arm_kg if isinstance(arm_kg, tuple) else (arm_kg / n,) * n
 
     @property

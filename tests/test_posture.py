@@ -1,4 +1,4 @@
-"""Posture: arms that hang, lie and stand are described, observed and told apart as they point."""
+"""Posture: arms that hang, lie and stand are described, observed and distinguished as they point."""
 
 import numpy as np
 import pytest

@@ -204,7 +204,7 @@ def test_actuators_are_the_paper_s_pumps_unless_a_file_says_otherwise(spec, data
     regulated.to_toml(tmp_path / "arm.toml")
     assert ArmSpec.from_toml(tmp_path / "arm.toml") == regulated != spec
     assert regulated.replace(actuators={"dead_time_s": 0.2}).actuators.lag_s == tuple(numbers["lag_s"])
-    for changes, told in (
+    for changes, message in (
         (
             {"lag_s": [0.3] * 8},
             "lag_s: got 8 numbers, expected one, or one for each of the 9 chambers",
@@ -212,4 +212,4 @@ def test_actuators_are_the_paper_s_pumps_unless_a_file_says_otherwise(spec, data
         ({"dead_time_s": 3.0}, "actuators.dead_time_s: got 3.0, expected a number >= 0 and <= 2"),
         ({"kind": "bellows"}, "actuators.kind: got 'bellows', expected pump or regulator"),
     ):
-        assert told in message_of(regulated.replace, actuators=changes)
+        assert message in message_of(regulated.replace, actuators=changes)

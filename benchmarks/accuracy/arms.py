@@ -2,36 +2,41 @@
 
 Each is a rod twin with seed 0, or one whose rod is SoRoMoX's. The commands are those of `docs/your-arm.md`.
 Each arm is measured around a circle and at a grid of goals over its workspace. With `--loads` it follows the
-circle with payloads, too, which the loop is not told. An arm is one job, whose results stay in its folder:
-the same command goes on where it ended.
+circle with payloads, too, which the loop does not know. The same command goes on where it ended.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
-import tempfile
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 from benchmarks.harness.common import names_of, target
-from benchmarks.harness.parallel import in_parallel
 from benchmarks.harness.peers import peer_python
+from benchmarks.harness.stages import WorkStage, claim, command, run_stages
 from mjx_softarm._support import cli
-from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import scaled
+from mjx_softarm._support.provenance import write_json
 from mjx_softarm.spec import ArmSpec
 
-DONE = (0, 1)  # exit statuses after which there are results
 N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
-
 
 # Turns [deg] of the base. An arm that stands must do so without pressure, before it is calibrated: the arm of
 # the paper, of 4.7 kg, falls over, a tenth of it stands.
 HANGS, STANDS = (0.0, 0.0, 0.0), (180.0, 0.0, 0.0)
+FIGURES = {
+    "goals": "points",
+    "measured": "measured",
+    "reached": "reached",
+    "mean [mm]": "translation_mm",
+    "95 % [mm]": "translation_95_mm",
+    "largest [mm]": "max_mm",
+    "mean [deg]": "rotation_deg",
+    "saturated": "saturated_points",
+}
 
 
 class Kind(NamedTuple):
@@ -63,6 +68,17 @@ ARMS = {
 }
 
 
+@dataclass(frozen=True)
+class ArmSettings:
+    """Size of the measurement."""
+
+    poses: int
+    preset: str
+    steps: int | None
+    points: int
+    loads: tuple[int, ...]
+
+
 def measure(
     arms: Annotated[tuple[str, ...], names_of(ARMS)] = tuple(name for name in ARMS if not ARMS[name].peer),
     poses: int = 300,
@@ -70,7 +86,7 @@ def measure(
     steps: int | None = None,
     points: int = 40,
     loads: cli.Integers = (),
-    keep: cli.MaybePath = None,
+    out: Path = Path("runs/arms"),
 ) -> dict[str, Any]:
     """How well do arms of several kinds follow goals, from recording to measurement, by the same commands?
 
@@ -81,99 +97,80 @@ def measure(
         steps: environment steps of each training; None: the preset's
         points: goals of the circle, and of the grid at most
         loads: payloads with which the circle is followed, too [g]
-        keep: folder for logs, calibrations and runs, to go on with later; without one they are deleted
+        out: working folder: the same command continues, and arms may be added
+
+    Raises:
+        JobError: a command failed, or the folder has other settings.
+        PeerError: SoRoMoX could not be installed.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        home = (keep or Path(folder)).absolute()
-        jobs = [(arm, _measure, (arm, home / arm, poses, preset, steps, points, loads)) for arm in arms]
-        found = in_parallel(jobs)
-    return {"targets": targets([found[arm] for arm in arms], arms), **{arm: found[arm] for arm in arms}}
+    settings, out = ArmSettings(poses, preset, steps, points, loads), out.absolute()
+    claim(out, settings)
+    run_stages(out, settings, [[WorkStage(arm, (f"{arm}/figures.json",), take, (arm,)) for arm in arms]])
+    figures = {arm: json.loads((out / arm / "figures.json").read_text("utf-8")) for arm in arms}
+    return {"targets": [_target(arm, row) for arm, row in figures.items()], **figures}
 
 
-def targets(figures: Sequence[dict[str, Any]], arms: Sequence[str]) -> list[dict[str, str]]:
-    """Return the target of each arm's circle."""
-    rows = []
-    for arm, row in zip(arms, figures, strict=True):
-        share, length_mm = row["circle, mean [mm]"] / row["length [mm]"], row["length [mm]"]
-        n, n_measured = row["circle, goals"], row["circle, measured"]
-        rows.append(
-            target(
-                f"{arm}: circle within {WITHIN:.1%} of {length_mm:g} mm, no goal refused",
-                f"{share:.2%} in the mean, {n - n_measured} of {n} goals refused",
-                share <= WITHIN and n == n_measured,
-            )
-        )
-    return rows
+def _target(arm: str, row: dict[str, Any]) -> dict[str, str]:
+    length_mm = row["length [mm]"]
+    share = row["circle, mean [mm]"] / length_mm
+    n_refused = row["circle, goals"] - row["circle, measured"]
+    return target(
+        f"{arm}: circle within {WITHIN:.1%} of {length_mm:g} mm, no goal refused",
+        f"{share:.2%} in the mean, {n_refused} of {row['circle, goals']} goals refused",
+        share <= WITHIN and not n_refused,
+    )
 
 
-def _measure(
-    arm: str,
-    folder: Path,
-    poses: int,
-    preset: str,
-    steps: int | None,
-    points: int,
-    loads: Sequence[int] = (),
-) -> dict[str, Any]:
-    """Take an arm through all commands; leave out those whose results are there."""
+def take(out: Path, settings: ArmSettings, arm: str) -> None:
+    """Take an arm through all commands, leaving out those whose results are there; write its figures."""
     # The arm, and its stand-in
+    folder, kind = out / arm, ARMS[arm]
     folder.mkdir(parents=True, exist_ok=True)
-    kind, file = ARMS[arm], folder / "arm.toml"
+    file, calibration, run = folder / "arm.toml", folder / "calibration", folder / "run"
     spec = ArmSpec.of(Path(kind.name))
     masses = {part: scaled(getattr(spec.mass, part), kind.mass_share) for part in ("arm_kg", "gripper_kg")}
     spec = spec.replace(mass=masses, mounting={"base_turn_deg": kind.turn_deg})
     spec.to_toml(file)
-    calibration = folder / "calibration"
-    run, policy = folder / "run", folder / "run/policy.npz"
-    logs = {folder / "poses.npz": (poses,), folder / "moving.npz": (N_MOVING, "--transients")}
+    stand_in = "--arm", kind.arm(file)
+    logs = {folder / "poses.npz": (settings.poses,), folder / "moving.npz": (N_MOVING, "--transients")}
+
+    def ensure(made: Path, *words: Any, on_arm: bool = False) -> None:
+        """Run a command unless what it makes exists."""
+        if not made.exists():
+            python = kind.python if on_arm else sys.executable
+            command(folder / "commands.log", *words, makes=made, python=python)
 
     # Record, calibrate, train and export
-    record = ("mjx_softarm.deploy", "record", "--arm", kind.arm(file), "--spec", file)
+    record = ("mjx_softarm.deploy", "record", *stand_in, "--spec", file)
     for log, options in logs.items():
-        if not log.exists():
-            run_command(*record, "--poses", *options, "--out", log, makes=log, python=kind.python)
-    if not calibration.exists():
-        report = calibration / "report.json"
-        run_command("calib", "run", *logs, "--spec", file, "--out", calibration, makes=report)
-    if not (run / "evaluation.json").exists():
-        options = ("--learner.total-env-steps", steps) if steps else ()
-        anew = ("--preset", preset, "--calibration", calibration, *options, "--out", run)
-        arguments = ("--resume", run) if (run / "config.json").exists() else anew
-        run_command("train", "reach", *arguments, makes=run / "evaluation.json")
-    if not policy.exists():
-        run_command("train", "export", run, makes=policy)
+        ensure(log, *record, "--poses", *options, "--out", log, on_arm=True)
+    ensure(calibration / "report.json", "calib", "run", *logs, "--spec", file, "--out", calibration)
+    steps = ("--learner.total-env-steps", settings.steps) if settings.steps else ()
+    begin = ("--preset", settings.preset, "--calibration", calibration, *steps, "--out", run)
+    resumed = (run / "config.json").exists()
+    ensure(run / "evaluation.json", "train", "reach", *(("--resume", run) if resumed else begin))
+    policy = run / "policy.npz"
+    ensure(policy, "train", "export", run)
 
     # Measure the policy on its arm
-    figures = {"length [mm]": 1e3 * spec.length_m, **_figures(folder)}
+    figures = {"length [mm]": 1e3 * spec.length_m, **_calibration_figures(calibration)}
     measured = {"circle": ("circle", 0), "grid": ("grid", 0)}
-    measured |= {f"circle, {load_g} g": ("circle", load_g) for load_g in loads}
+    measured |= {f"circle, {load_g} g": ("circle", load_g) for load_g in settings.loads}
     for title, (goals, load_g) in measured.items():
-        out = folder / title.replace(", ", "-").replace(" ", "")
-        if not (out / "accuracy.json").exists():
-            options = "--goals", goals, "--points", points, *(("--payload", load_g) if load_g else ())
-            accuracy_of(policy, kind.arm(file), out, *options, python=kind.python)
-        accuracy = json.loads((out / "accuracy.json").read_text("utf-8"))
+        new = folder / title.replace(", ", "-").replace(" ", "")
+        options = ("--goals", goals, "--points", settings.points, *(("--payload", load_g) if load_g else ()))
+        asked = ("mjx_softarm.deploy", "measure", policy, *stand_in, *options, "--out", new)
+        ensure(new / "accuracy.json", *asked, on_arm=True)
+        accuracy = json.loads((new / "accuracy.json").read_text("utf-8"))
         figures |= {f"{title}, {what}": accuracy[key] for what, key in FIGURES.items()}
         if load_g:
-            figures[f"{title}, told [g]"] = accuracy["load_estimate_g"]
-    return figures
+            figures[f"{title}, estimated [g]"] = accuracy["load_estimate_g"]
+    write_json(folder / "figures.json", figures)
 
 
-FIGURES = {
-    "goals": "points",
-    "measured": "measured",
-    "reached": "reached",
-    "mean [mm]": "translation_mm",
-    "95 % [mm]": "translation_95_mm",
-    "largest [mm]": "max_mm",
-    "mean [deg]": "rotation_deg",
-    "saturated": "saturated_points",
-}
-
-
-def _figures(folder: Path) -> dict[str, Any]:
+def _calibration_figures(calibration: Path) -> dict[str, Any]:
     """Return figures of a calibration's report."""
-    report = json.loads((folder / "calibration/report.json").read_text("utf-8"))
+    report = json.loads((calibration / "report.json").read_text("utf-8"))
     chambers, network = (report["parts"][title]["figures"] for title in ("Chambers", "Sim-to-real network"))
     return {
         "calibration without warnings": report["trustworthy"],
@@ -181,38 +178,3 @@ def _figures(folder: Path) -> dict[str, Any]:
         "tip without S2R, held out [mm]": network["test_uncorrected"]["translation_mean_mm"],
         "tip with S2R, held out [mm]": network["test"]["translation_mean_mm"],
     }
-
-
-def accuracy_of(
-    policy: Path, arm: str, out: Path, *options: Any, python: Path | str = sys.executable
-) -> dict[str, Any]:
-    """Measure a policy on an arm by `deploy measure`; return the figures, which stay in the new folder `out`.
-
-    Raises:
-        InputError: the command failed, or arrived at no goal.
-    """
-    file = out / "accuracy.json"
-    asked = ("measure", policy, "--arm", arm, *options, "--out", out)
-    run_command("mjx_softarm.deploy", *asked, makes=file, python=python)
-    return json.loads(file.read_text("utf-8"))
-
-
-def run_command(*words: Any, makes: Path, python: Path | str = sys.executable) -> int:
-    """Run a command of this project, its output shown; return its exit status, one of `DONE`.
-
-    Args:
-        words: of the command line, after `python -m`.
-        makes: file that the command writes. A command that ends with an exception has status 1, too.
-        python: interpreter, whose environment may have other packages.
-
-    Raises:
-        InputError: the command ended with none of `DONE`, or without the file.
-    """
-    command = [str(word) for word in words]
-    status = subprocess.run([str(python), "-m", *command], check=False).returncode
-    asked = f"python -m {' '.join(command)}"
-    if status not in DONE:
-        raise InputError(f"{asked}: got exit status {status}, expected {' or '.join(map(str, DONE))}")
-    if not makes.exists():
-        raise InputError(f"{asked}: got no file {makes}, expected its results")
-    return status

@@ -12,42 +12,19 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.figure import Figure
 
-from benchmarks.harness.common import RESULTS, names_of
-from benchmarks.paper.engine import WorkStage, command, run_stages
-from benchmarks.paper.kinds import EVALUATION_FILE
+from benchmarks.harness.common import names_of
+from benchmarks.harness.stages import WorkStage, claim, command, run_stages
 from mjx_softarm._support import cli, xla
 from mjx_softarm.logs.schema import Log, write_log
-from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.pipe import PIPES
 from mjx_softarm.sensing.pose import quaternion_from_pose
 from mjx_softarm.spec import ArmSpec
-from train.demos.demonstrations import Demonstrations
 from train.demos.expert import Expert
 from train.demos.waypoints import task as waypoints_of
-from train.runs import plots
 from train.runs.folder import Run
-from train.runs.positions import PositionEvaluator
-from train.runs.run import task_of_run
 
-PICTURE = "printed.png"
-N_POINTS = 40  # of the circle that a policy of its 16 demonstrated points follows
 PRESETS = {"circle16": "paper-circle", "pipe300": "paper-pipe"}
-# Panels of the picture, and the cases in it: task, figure and title; case and label
-PANELS = (
-    ("circle", "median_mm", "median error [mm]"),
-    ("circle", "success_share", "share of the positions with success"),
-    ("pipe", "success_share", "share of the positions with success"),
-)
-SHOWN = {
-    "learned": "learned",
-    "hand-made": "hand-made",
-    "learned-all-three": "learned, three changes",
-    "hand-made-all-three": "hand-made, three changes",
-    "hand-made-near-goals": "hand-made, near goals",
-}
 LOSSES = {"tqc/critic_loss": "critics' loss", "tqc/actor_loss": "actor's loss"}
 LOSSES |= {"gail/discriminator_loss": "discriminator's loss"}
 
@@ -100,8 +77,6 @@ def measure(
 ) -> dict[str, Any]:
     """Does the paper's recipe work as printed, in simulation, and what does each change to it bring?
 
-    The picture is `docs/results/printed.png`.
-
     Args:
         out: working folder: the same command continues, and seeds and cases may be added
         seeds: of training; changes have the first alone
@@ -109,34 +84,25 @@ def measure(
         env_steps: of each run, with stages in proportion; None: 300,000 on the circle, a million in the pipe
 
     Raises:
-        JobError: a training failed.
+        JobError: a training failed, or the folder has other settings.
     """
     # Demonstrate, and train what is not trained yet.
-    out.mkdir(parents=True, exist_ok=True)
+    settings = PrintedSettings(env_steps)
+    claim(out, settings)
     runs = {name: seeds[:1] if CASES[name].one_seed else seeds for name in cases}
     tasks = dict.fromkeys(CASES[name].task for name in cases)
     demonstrated = [WorkStage(f"demonstrate {t}", (demos_file(t),), demonstrate, (t,)) for t in tasks]
     trained = [
-        WorkStage(f"{name}, seed {seed}", (f"{run_name(name, seed)}/{EVALUATION_FILE}",), train, (name, seed))
+        WorkStage(f"{name}, seed {seed}", (f"{run_name(name, seed)}/evaluation.json",), train, (name, seed))
         for name, own in runs.items()
         for seed in own
     ]
-    run_stages(out, PrintedSettings(env_steps), [demonstrated, trained])
-    # Gather the figures, and draw the curves.
-    opened = {name: [Run.open(out / run_name(name, seed)) for seed in own] for name, own in runs.items()}
-    metrics = {name: [run.metrics() for run in own] for name, own in opened.items()}
-    curves_figure(metrics).savefig(RESULTS / PICTURE, dpi=plots.DPI)
-    circles = circle_errors([run for name, own in opened.items() if "circle" in name for run in own])
+    run_stages(out, settings, [demonstrated, trained])
+    metrics = {name: [Run.open(out / run_name(name, n)).metrics() for n in own] for name, own in runs.items()}
+    penalised = [name for name in runs if name.startswith("circle-learned")]
     return {
-        "cases": [
-            over_seeds(name, metrics[name], [circles.get(r.path, {}) for r in opened[name]]) for name in runs
-        ],
-        "losses": [
-            row
-            for name in runs
-            if "learned" in name and "circle" in name
-            for row in loss_rows(name, metrics[name][0])
-        ],
+        "cases": [over_seeds(name, metrics[name]) for name in runs],
+        "losses": [row for name in penalised for row in loss_rows(name, metrics[name][0])],
         "curves": curves(metrics),
     }
 
@@ -177,33 +143,17 @@ def demonstrate(folder: Path, settings: PrintedSettings, task: str) -> None:
 def train(folder: Path, settings: PrintedSettings, name: str, seed: int) -> None:
     """Train a policy of a case, or resume an interrupted run."""
     run, case = folder / run_name(name, seed), CASES[name]
-    log = run.with_suffix(".log")
+    log, made = run.with_suffix(".log"), run / "evaluation.json"
     if (run / "config.json").exists():
-        command(log, "imitate", "--resume", str(run))
+        command(log, "train", "imitate", "--resume", run, makes=made)
         return
-    options = ["--preset", PRESETS[case.task], "--seed", str(seed), "--out", str(run)]
+    options = ["--preset", PRESETS[case.task], "--seed", seed, "--out", run]
     if pipe := PIPES.get(case.task):
         options += ["--pipe", f"{1e3 * pipe.diameter_m:g}"]
     if settings.env_steps:
-        options += ["--learner.total-env-steps", str(settings.env_steps)]
+        options += ["--learner.total-env-steps", settings.env_steps]
     changes = [f"--{text.removesuffix('=true')}" for text in case.settings]  # a flag has no value
-    command(log, "imitate", str(folder / demos_file(case.task)), *options, *changes)
-
-
-def circle_errors(runs: Sequence[Run]) -> dict[Path, dict[str, float]]:
-    """Return the errors [mm] of runs at all points of the circle, by folder; mean and RMSE."""
-    evaluate, errors = None, {}
-    for run in runs:
-        if evaluate is None:
-            own, positions = task_of_run(run).evaluate, circle_poses(run.spec, N_POINTS)
-            shown = Demonstrations(
-                positions, np.zeros((N_POINTS, run.spec.n_springs)), np.zeros(N_POINTS, int)
-            )
-            evaluate = PositionEvaluator(own.env, own.learner, shown, np.ones(N_POINTS, bool))
-        _, found = evaluate(run.policy())
-        mm = found.reached.tip_error_mm
-        errors[run.path] = {"circle_mm": float(mm.mean()), "circle_rmse_mm": float(np.sqrt((mm**2).mean()))}
-    return errors
+    command(log, "train", "imitate", folder / demos_file(case.task), *options, *changes, makes=made)
 
 
 FIGURES = (
@@ -212,20 +162,12 @@ FIGURES = (
 )
 
 
-def over_seeds(
-    name: str, metrics: Sequence[Sequence[Mapping[str, Any]]], circles: Sequence[Mapping[str, float]]
-) -> dict[str, Any]:
+def over_seeds(name: str, metrics: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Return the final figures of a case: mean over its seeds, and least and greatest."""
     last = [{key.removeprefix("evaluation/"): x for key, x in rows[-1].items()} for rows in metrics]
-    rows = [row | dict(circle) for row, circle in zip(last, circles, strict=True)]
-    names = [key for key in (*FIGURES, "circle_mm", "circle_rmse_mm") if key in rows[0]]
-    counts = {key: rows[0][key] for key in ("env_steps", "updates")}
-    return {
-        "case": name,
-        "seeds": len(rows),
-        **counts,
-        **{key: _spread([row[key] for row in rows]) for key in names},
-    }
+    counts = {key: last[0][key] for key in ("env_steps", "updates")}
+    spread = {key: _spread([row[key] for row in last]) for key in FIGURES if key in last[0]}
+    return {"case": name, "seeds": len(last), **counts, **spread}
 
 
 def _spread(values: Sequence[float]) -> str:
@@ -262,37 +204,3 @@ def loss_rows(name: str, rows: Sequence[Mapping[str, float]]) -> list[dict[str, 
             }
         )
     return found
-
-
-def curves_figure(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
-    """Draw errors and success over env steps, and the losses with and without the penalty."""
-    figure = Figure(figsize=(12, 7), layout="constrained")
-    panels = figure.subplots(2, 3)
-    # Both rewards as printed, over the seeds, and with the changes that reach goals.
-    for panel, (task, key, title) in zip(panels[0], PANELS, strict=True):
-        cases = {name: runs for name, runs in metrics.items() if name.startswith(task)}
-        if not cases:
-            panel.set_axis_off()
-            continue
-        plots.dress(panel, f"{task}: {title}", plots.STEPS, "")
-        for k, (name, change) in enumerate(SHOWN.items()):
-            if runs := cases.get(f"{task}-{name}"):
-                rows = [[row for row in run if f"evaluation/{key}" in row] for run in runs]
-                steps, colour = [row["env_steps"] for row in rows[0]], colormaps["tab10"](k)
-                values = np.array([[row[f"evaluation/{key}"] for row in run] for run in rows])
-                panel.plot(steps, values.mean(axis=0), color=colour, label=change)
-                panel.fill_between(steps, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.2)
-        panel.set_yscale("log" if key == "median_mm" else "linear")
-    panels[0][0].legend(frameon=False)
-    # Losses, of the first seed.
-    penalties = {"": "on D, as printed", "-penalty-on-the-logit": "on the logit", "-no-penalty": "none"}
-    for panel, (key, title) in zip(panels[1], LOSSES.items(), strict=True):
-        plots.dress(panel, f"circle, learned: {title}", plots.STEPS, "")
-        for k, (change, label) in enumerate(penalties.items()):
-            if runs := metrics.get(f"circle-learned{change}"):
-                rows = [row for row in runs[0] if row["updates"]]
-                steps = [row["env_steps"] for row in rows]
-                panel.plot(steps, [row[key] for row in rows], color=colormaps["tab10"](k), label=label)
-        panel.set_yscale("linear" if "discriminator" in title else "symlog")
-    panels[1][0].legend(frameon=False, title="gradient penalty")
-    return figure

@@ -22,7 +22,6 @@ from rich.text import Text
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import cli
-from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from train.epoch.devices import mesh_of
 
@@ -39,44 +38,13 @@ def n_cores() -> int:
 def cpu_kind() -> str:
     """Return the CPU's name and the number of its cores that this process may use."""
     info = Path("/proc/cpuinfo")
-    found = re.search(r"model name\s*: (.+)", info.read_text("utf-8")) if info.exists() else None
-    return f"{found[1].strip() if found else platform.processor() or platform.machine()}, {n_cores()} cores"
+    name = re.search(r"model name\s*: (.+)", info.read_text("utf-8")) if info.exists() else None
+    return f"{name[1].strip() if name else platform.processor() or platform.machine()}, {n_cores()} cores"
 
 
 def machine_kind() -> str:
     """Return the name of the GPU if JAX runs on one, else `cpu_kind`."""
     return jax.devices()[0].device_kind if jax.default_backend() == "gpu" else cpu_kind()
-
-
-def three_of(text: str, option: str, form: str) -> tuple[str, str, str]:
-    """Return the parts of an option's text of a form such as NAME=ARM=FILE.
-
-    Raises:
-        InputError: the text has another form.
-    """
-    parts = text.split("=")
-    if len(parts) != 3 or not all(parts):
-        raise InputError(f"{option}: got {text}, expected {form}")
-    return parts[0], parts[1], parts[2]
-
-
-def arms_and_files(
-    texts: Sequence[str], option: str = "--policies", file: str = "FILE"
-) -> list[tuple[str, str]]:
-    """Return arm and file of each text ARM=FILE of an option.
-
-    Raises:
-        InputError: there are none, or one has another form.
-    """
-    if not texts:
-        raise InputError(f"{option}: got none, expected ARM={file} of each")
-    found = []
-    for text in texts:
-        arm, separator, path = text.partition("=")
-        if not separator:
-            raise InputError(f"{option}: got {text}, expected ARM={file}, such as twin:0=runs/mine")
-        found.append((arm, path))
-    return found
 
 
 def mesh_of_cores(n_arms: int) -> Mesh | None:
@@ -95,13 +63,6 @@ def mesh_of_cores(n_arms: int) -> Mesh | None:
 def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
     """Return a row for a target; if `met` is None it could not be measured, and `measured` says why."""
     return {"target": text, "measured": measured, "verdict": VERDICT[met]}
-
-
-def difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
-    """Return "got ..., expected ..." of the settings that differ from those expected, or "" if none does."""
-    names = [name for name in expected if found.get(name) != expected[name]]
-    got, asked = (", ".join(f"{name} {values.get(name)}" for name in names) for values in (found, expected))
-    return f"got {got}, expected {asked}" if names else ""
 
 
 def names_of(known: Iterable[str]) -> PrimitiveConstructorSpec:
@@ -191,9 +152,9 @@ def _cell(value: Any) -> str:
     return "" if value is None else str(value)
 
 
-def save(name: str, figures: dict[str, Any]) -> Path:
-    """Write figures with machine, versions, command and commit to `docs/results/NAME.json`."""
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{name}.json"
+def save(name: str, figures: dict[str, Any], folder: Path | None = None) -> Path:
+    """Write figures with machine, versions, command and commit to NAME.json in `docs/results` or a folder."""
+    path = (folder or RESULTS) / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"figures": figures, **provenance("benchmarks")})
     return path

@@ -14,9 +14,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.accuracy.arms import run_command
 from benchmarks.harness.common import machine_kind, n_cores
 from benchmarks.harness.rounds import Worker, take_turns
+from benchmarks.harness.stages import command
 from benchmarks.speed.throughput import figures_of
 from mjx_softarm._support import cli
 from train.sweep.run import open_sweep
@@ -103,12 +103,12 @@ def training(preset: str, sweep: Path) -> list[dict[str, Any]]:
     """Train with some seeds at once; return a row for each, with its times to each level of `LEVELS_MM`.
 
     Raises:
-        InputError: the training failed.
+        JobError: the training failed.
     """
     seeds, options = TRAININGS[preset]
     words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
-    command = ("train", "sweep", "--preset", preset, "--seeds", seeds, *words, "--out", sweep)
-    run_command(*command, makes=sweep / "results.json")
+    asked = ("train", "sweep", "--preset", preset, "--seeds", seeds, *words, "--out", sweep)
+    command(sweep.with_suffix(".log"), *asked, makes=sweep / "results.json")
     rows = []
     for run in open_sweep(sweep).runs:
         figures = json.loads((run.path / "evaluation.json").read_text("utf-8"))

@@ -93,7 +93,7 @@ class ArmOptions:
         """Open the driver of an arm with this specification, and its motion capture, which reports its gaps.
 
         Raises:
-            InputError: one of them cannot be had.
+            InputError: one of them is not available.
         """
         return with_capture(open_arm(self.arm), self.capture, spec, tell)
 
@@ -108,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-    on: Arms,
+    options: Arms,
     goal: tyro.conf.UseAppendAction[tuple[Goal, ...]],
     policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     log: cli.MaybePath = None,
@@ -132,8 +132,8 @@ def _run(
     controller = _controller(policy)
     goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
-    driver = on.open(controller.policy.spec, tell)
-    check_arm(driver, controller, f"--arm {on.arm}")
+    driver = options.open(controller.policy.spec, tell)
+    check_arm(driver, controller, f"--arm {options.arm}")
 
     # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
@@ -153,7 +153,7 @@ def _controller(policy: Path) -> Controller:
 
 
 def _measure(
-    on: Arms,
+    options: Arms,
     out: Path,
     policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
@@ -181,9 +181,9 @@ def _measure(
     poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
-    driver = on.open(controller.policy.spec, tell)
-    first_frame(driver, f"--arm: {on.arm}")
-    check_arm(driver, controller, f"--arm {on.arm}")
+    driver = options.open(controller.policy.spec, tell)
+    first_frame(driver, f"--arm: {options.arm}")
+    check_arm(driver, controller, f"--arm {options.arm}")
 
     # The run, stop by stop or in time
     out.mkdir(parents=True)
@@ -201,12 +201,12 @@ def _measure(
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     finish(driver, tell)
     if run.arrivals:
-        _tell_measured(run, controller, poses, out, payload_kg if seconds is None else None)
+        _report_accuracy(run, controller, poses, out, payload_kg if seconds is None else None)
     print_run(run, controller.policy)
     return run.status
 
 
-def _tell_measured(
+def _report_accuracy(
     run: LoopRun, controller: Controller, poses: np.ndarray, out: Path, payload_kg: float | None
 ) -> None:
     """Write and print the figures of a run, and what makes its error.
@@ -218,7 +218,8 @@ def _tell_measured(
         out: folder to write to.
         payload_kg: payload at the gripper; None: do not say what makes the error.
     """
-    accuracy, ways = measure(run, controller, poses), ways_of(run)
+    accuracy = measure(run, controller, poses)
+    ways = ways_of(run)
     numbers = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
@@ -238,7 +239,7 @@ def _tell_measured(
 
 
 def _record(
-    on: Arms,
+    options: Arms,
     out: Path,
     spec: cli.SpecFile = None,
     poses: int = 500,
@@ -256,19 +257,19 @@ def _record(
     # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
-    twin = twin_spec(on.arm)
+    twin = twin_spec(options.arm)
     arm_spec = ArmSpec.of(spec or twin)
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
 
-    driver = on.open(arm_spec, tell)
-    check_number(driver, arm_spec, f"--arm {on.arm}")
+    driver = options.open(arm_spec, tell)
+    check_number(driver, arm_spec, f"--arm {options.arm}")
     low, high = arm_spec.chambers.pressure_min_kpa, arm_spec.chambers.pressure_max_kpa
     default = "" if spec or twin else ", by default; --spec names another arm"
     tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
-    if spec and on.arm.startswith("twin:") and ArmSpec.of(twin).geometry != arm_spec.geometry:
-        tell(f"{on.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
+    if spec and options.arm.startswith("twin:") and ArmSpec.of(twin).geometry != arm_spec.geometry:
+        tell(f"{options.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results
     targets_kpa = growing(random_pressures(arm_spec, poses, seed))

@@ -77,7 +77,8 @@ class Belief:
         window = Window(*(np.empty((0, n)) for n in (n_springs, n_chambers, n_chambers)))
         springs = np.zeros(n_springs, int), np.zeros(n_springs, bool)
         chambers = np.zeros(n_chambers, int), np.zeros(n_chambers, bool)
-        unknown_m, load = np.full(n_springs, np.nan), Load.assumed(spec.mass.payload_kg)
+        unknown_m = np.full(n_springs, np.nan)
+        load = Load.assumed(spec.mass.payload_kg)
         return cls(
             controller, Command.none(spec), window, unknown_m, *springs, *chambers, load, np.zeros(n_chambers)
         )
@@ -155,18 +156,19 @@ def believe(
 
 def _with_trust(belief: Belief, last: Belief) -> Belief:
     """Return the belief with rest, and with sensors and chambers that are in doubt."""
-    controller, policy, command = belief.controller, belief.controller.policy, belief.command
-    gains, pressure_kpa, asked_m = policy.gains, command.pressure_kpa, command.reference_m
+    controller, policy = belief.controller, belief.controller.policy
+    pressure_kpa, asked_m = belief.command.pressure_kpa, belief.command.reference_m
     springs_m = belief.window.spring_m
     if len(springs_m) == controller.window:
-        at_rest = command.n_ticks >= controller.window and bool(still(springs_m, controller.rest.still_m))
+        at_rest = belief.command.n_ticks >= controller.window and bool(
+            still(springs_m, controller.rest.still_m)
+        )
         stuck = stuck_springs(springs_m, belief.window.pressure_kpa, policy.spec.structure.n_sections)
         belief = replace(belief, at_rest=at_rest, stuck=stuck)
     if asked_m is None or not belief.known:
         return belief
 
-    arrived_m, tolerance_m = controller.rest.arrived_m, policy.tolerance_m
-    settled = belief.at_rest and bool(on_reference(springs_m, asked_m, pressure_kpa, gains, arrived_m))
+    gains, tolerance_m = policy.gains, policy.tolerance_m
     suspect = saturated(pressure_kpa, asked_m, belief.spring_m, gains, tolerance_m)
     if suspect.any():
         suspect &= explained_by_pressure_loss(
@@ -174,7 +176,8 @@ def _with_trust(belief: Belief, last: Belief) -> Belief:
         )
     return replace(
         belief,
-        settled=settled,
+        settled=belief.at_rest
+        and bool(on_reference(springs_m, asked_m, pressure_kpa, gains, controller.rest.arrived_m)),
         saturated=saturated(pressure_kpa, asked_m, belief.mean_m, gains, tolerance_m),
         n_suspect=np.where(suspect, last.n_suspect + 1, 0),
     )
@@ -189,7 +192,8 @@ def _with_load(belief: Belief, last: Belief) -> Belief:
     doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
     if not belief.at_rest or belief.n_unweighed < belief.controller.window or doubtful:
         return belief
-    model, load = belief.controller.policy.load_estimator, last.load
+    model = belief.controller.policy.load_estimator
+    load = last.load
     most_kg = float(model.load_scale_kg)
     mean_kpa = belief.window.chamber_kpa.mean(axis=0)
     estimate_kg, width_kg = map(float, estimate_load(model, belief.mean_m, mean_kpa, belief.stop))
@@ -262,7 +266,8 @@ def stuck_springs(spring_m: Array, pressure_kpa: Array, n_sections: int) -> Arra
         pressure_kpa (ticks, n_chambers) [kPa]: commanded pressures of these ticks.
         n_sections: number of sections.
     """
-    xp, n_springs = array_namespace(spring_m), spring_m.shape[1]
+    xp = array_namespace(spring_m)
+    n_springs = spring_m.shape[1]
     beside_kpa = pressure_kpa[:, :: pressure_kpa.shape[1] // n_springs]  # every k-th chamber has a spring
     driven = _range(beside_kpa) > STUCK_PRESSURE_KPA
     section_m = xp.max(_range(spring_m).reshape(n_sections, -1), axis=1)[:, None]  # (n_sections, 1)
@@ -295,7 +300,8 @@ def explained_by_pressure_loss(
         spring_m (n_springs,) [m]: lengths.
         allocation: matrices of an arm with redundant chambers.
     """
-    xp, diagonal = array_namespace(pressure_kpa, spring_m), np.eye(len(pressure_kpa), dtype=bool)
+    xp = array_namespace(pressure_kpa, spring_m)
+    diagonal = np.eye(len(pressure_kpa), dtype=bool)
     one_less_kpa = xp.where(diagonal, 0.0, pressure_kpa)  # (n_chambers, n_chambers)
     pressures_kpa = xp.concat([pressure_kpa[None], one_less_kpa])
     springs_m = expected_springs(model, pressures_kpa)

@@ -36,7 +36,8 @@ NAMED_MM = 0.4  # shift of a spring's zero that the sentence names
 MIN_GOALS = 8  # goals that show a change of the arm; `calib run --since` refuses fewer
 # Shift of a zero, and largest part over the error, from which the arm is hardly that of the calibration; by
 # hand. Aged twins have 1.5 mm and 1.0, policies on other twins of the same arm 14 mm.
-STRANGE_MM, STRANGE_RATIO = 5.0, 1.5
+STRANGE_MM = 5.0
+STRANGE_RATIO = 1.5
 
 
 class Budget(NamedTuple):
@@ -128,7 +129,8 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float) -> Budget | 
     both = [(goal, rest) for goal, rest in both if np.isfinite([*rest.error, *rest.spring_m]).all()]
     if not both:
         return None
-    goal, seen = np.array([goal for goal, _ in both]), np.array([rest.error for _, rest in both])  # (p, 6)
+    goal = np.array([goal for goal, _ in both])
+    seen = np.array([rest.error for _, rest in both])  # (p, 6)
     spring_m, reference_m = (
         np.array([getattr(rest, name) for _, rest in both]) for name in ("spring_m", "reference_m")
     )
@@ -220,7 +222,8 @@ def draw(parts: Budget, path: Path) -> None:
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     axes = figure.subplots()
     ordered = sorted(parts.parts_mm.items(), key=lambda item: item[1])
-    names, values = [name for name, _ in ordered], [value for _, value in ordered]
+    names = [name for name, _ in ordered]
+    values = [value for _, value in ordered]
     colours = ["tab:red" if name == parts.largest else "tab:blue" for name in names]
     axes.bar_label(axes.barh(names, values, color=colours), fmt="%.2f", padding=3)
     axes.set(xlabel=f"part of the mean tip error of {parts.total_mm:.2f} mm [mm]")

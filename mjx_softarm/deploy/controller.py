@@ -59,5 +59,6 @@ class Command(NamedTuple):
     @classmethod
     def none(cls, spec: ArmSpec) -> Command:
         """Return the command of an arm without pressure."""
-        zero_kpa, unknown_m = np.zeros(spec.n_chambers), np.full(spec.n_springs, np.nan)
+        zero_kpa = np.zeros(spec.n_chambers)
+        unknown_m = np.full(spec.n_springs, np.nan)
         return cls(None, 0, LawState.at_rest(zero_kpa, unknown_m), zero_kpa)

@@ -42,7 +42,9 @@ class Hold:
     """Sensor-space law from the first lengths to references (n_springs,) [m]."""
 
     def __init__(self, gains: Gains, reference_m: np.ndarray, dt_s: float):
-        self._gains, self._goal_m, self._dt_s = gains, np.asarray(reference_m, float), dt_s
+        self._gains = gains
+        self._goal_m = np.asarray(reference_m, float)
+        self._dt_s = dt_s
         self.reference_m: np.ndarray | None = None  # on its way; None before the first reading
         self._state: Any = None
         self._off_m: Any = np.inf  # (n_springs,) running mean of the error
@@ -52,7 +54,8 @@ class Hold:
         if spring_m is None:
             return in_force_kpa, False
         if self.reference_m is None:
-            self.reference_m, self._state = spring_m, LawState.at_rest(in_force_kpa, spring_m)
+            self.reference_m = spring_m
+            self._state = LawState.at_rest(in_force_kpa, spring_m)
             self._off_m = spring_m - self._goal_m
         # References a tick further, pressures, running mean of the error
         left_m = self._goal_m - self.reference_m
@@ -77,7 +80,9 @@ class Drive:
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
         self.on_tick = on_tick
-        self.spec, self.sensor, self.gains = spec, spec.spring_sensor, Gains.from_spec(spec)
+        self.spec = spec
+        self.sensor = spec.spring_sensor
+        self.gains = Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
         self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
         self.link = Link(arm, spec, self.dt_s)

@@ -17,7 +17,11 @@ from mjx_softarm.deploy.link import Link, describe
 from mjx_softarm.logs.schema import Log, write_log
 
 # Exit statuses; that of a signal is 128 + its number.
-DONE, MISSED, NOT_WRITTEN, FAULT, INTERRUPTED = 0, 1, 2, 3, 130
+DONE = 0
+MISSED = 1
+NOT_WRITTEN = 2
+FAULT = 3
+INTERRUPTED = 130
 _INTERRUPTS = {"drive": 0, "vent": 1, "save": 2}  # number of Ctrl-C so far that a step survives
 
 
@@ -65,12 +69,14 @@ class _Finish:
     """Steps that run one after the other, even after one that raises."""
 
     def __init__(self, steps: dict[str, Callable[[], Any]]):
-        self._steps, self._running = steps, ""
+        self._steps = steps
+        self._running = ""
         self._signals: list[int] = []  # signals that ended no step
         self._n_interrupts = 0
         self.causes: list[str] = []
         self.lines: list[str] = []  # messages for `tell`
-        self.status, self.vented = DONE, True
+        self.status = DONE
+        self.vented = True
 
     def run(self) -> None:
         for step in self._steps:

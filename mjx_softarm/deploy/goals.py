@@ -57,10 +57,15 @@ class ListedGoals:
         duration_s: float | None = None,
         stay: bool = False,
     ):
-        self._controller, self._goals, self._refused = controller, list(goals), refused
-        self._duration_s, self._stays = duration_s, stay
-        self._began_s, self._accepted = np.nan, False
-        self.n_goals, self.n_taken = len(self._goals), 0
+        self._controller = controller
+        self._goals = list(goals)
+        self._refused = refused
+        self._duration_s = duration_s
+        self._stays = stay
+        self._began_s = np.nan
+        self._accepted = False
+        self.n_goals = len(self._goals)
+        self.n_taken = 0
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
         """Go on to the next accepted goal where there is none; end after the last one, or the duration."""
@@ -75,7 +80,8 @@ class ListedGoals:
         """Return the state with the next accepted goal, if it has none, and the refusals until then."""
         refusals = []
         while state.goal is None and self.n_taken < len(self._goals):
-            goal, refusal = self._goals[self.n_taken], self._refused.get(self.n_taken)
+            goal = self._goals[self.n_taken]
+            refusal = self._refused.get(self.n_taken)
             self.n_taken += 1
             if refusal:
                 refusals.append(refusal)
@@ -97,10 +103,12 @@ class OrderedGoals(ListedGoals):
         """Obey the order since the last tick."""
         order = self._orders()
         if isinstance(order, str):
-            self._goals, self.n_taken = [], 0
+            self._goals = []
+            self.n_taken = 0
             state = {"vent": release, "hold": hold}[order](state)
         elif order is not None:
-            self._goals, self.n_taken = list(order), 0
+            self._goals = list(order)
+            self.n_taken = 0
             state = state._replace(goal=None)
         return self.take_next(state)
 
@@ -120,12 +128,17 @@ class MovingGoal:
         pace_s: float,
         refused: Mapping[int, Event],
     ):
-        self._controller, self._poses, self._pace_s = controller, np.asarray(goals, float), pace_s
+        self._controller = controller
+        self._poses = np.asarray(goals, float)
+        self._pace_s = pace_s
         self._lead_s, self._start_s = lead_of(controller)  # before the arm moves: it may take seconds
         self._refused = refused
         self._stops = np.union1d(np.flatnonzero(stops), [0, len(goals) - 1])
-        self._began_s, self._leg = 0.0, self._poses
-        self.n_goals, self.n_taken, self.ways = len(self._stops), 0, list[slice]()
+        self._began_s = 0.0
+        self._leg = self._poses
+        self.n_goals = len(self._stops)
+        self.n_taken = 0
+        self.ways = list[slice]()
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
         """Move the goal, from an arrival at a stop until the goal is at the next."""
@@ -141,7 +154,8 @@ class MovingGoal:
             self.n_taken = stop + 1
             if k < 0:
                 return self._stop(state)
-            self._began_s, self._leg = now_s + self._start_s, self._poses[k : stop + 1]
+            self._began_s = now_s + self._start_s
+            self._leg = self._poses[k : stop + 1]
             self.ways.append(slice(row, row))
         elif state.ahead is None:
             return state, ()

@@ -29,7 +29,8 @@ LOST_TICKS = 3  # ticks in a row without a reading after which a sensor counts a
 LATE_TICKS = 5  # late ticks in a row after which the arm counts as late; by hand
 VENT_KPA_PER_S = 20.0  # ramp to zero; by hand
 VENT_TRIES = 250  # failed writes in a row after which the arm counts as not vented; some 5 s, by hand
-LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
+LOOKS = 50  # number of frames tried before an arm moves
+LOOK_S = 0.02  # time between two of them
 
 
 def vented(pressure_kpa: Array, dt_s: float) -> Array:
@@ -53,7 +54,9 @@ class Link:
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, dt_s: float):
         self._arm: Any = arm
-        self._spec, self._dt_s, self._n_late = spec, dt_s, 0
+        self._spec = spec
+        self._dt_s = dt_s
+        self._n_late = 0
         self._simulated = hasattr(arm, "time_s")
         self.measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
         # Shapes of logged arrays; the first frame gives the shape of the markers.
@@ -110,7 +113,9 @@ class Link:
                     f"write_pressures: got {self._n_late} late in a row, expected {most} at most"
                 ) from error
             return False
-        self._unsure, self._n_late, self.pressure_kpa = False, 0, pressure_kpa
+        self.pressure_kpa = pressure_kpa
+        self._n_late = 0
+        self._unsure = False  # last: a signal may come between these lines
         return True
 
     def look(self, time_s: float) -> dict[str, Any]:

@@ -106,7 +106,8 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy
     mask = np.zeros((len(goals), policy.spec.n_chambers), bool)
     arrival_s, load_estimate_g = np.full((2, len(goals)), np.nan)
     for arrival in run.arrivals:
-        point, rest = arrival.index, at_rest(run, controller, arrival)
+        point = arrival.index
+        rest = at_rest(run, controller, arrival)
         error[point], mask[point], load_estimate_g[point] = rest.error, rest.saturated, 1e3 * rest.load_kg
         believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
         arrival_s[point] = run.log.time_s[arrival.row]
@@ -129,14 +130,16 @@ def at_rest(run: LoopRun, controller: Controller, arrival: Arrival) -> Rest:
     Raises:
         InputError: motion capture saw nothing, or no tick was logged.
     """
-    log, policy = run.log, controller.policy
+    log = run.log
+    policy = controller.policy
     if log.tip_m is None or log.tip_quaternion is None:
         raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
     assert log.pressure_kpa is not None and log.reference_m is not None
     assert log.readings is not None and log.load_kg is not None
     rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
     spring_m = _finite_mean(policy.sensor.lengths(log.readings[rows], np.nan).length_m)
-    reference_m, law = log.reference_m[arrival.row], policy.gains.measured()
+    reference_m = log.reference_m[arrival.row]
+    law = policy.gains.measured()
     mean_kpa = _finite_mean(log.pressure_kpa[rows])
     return Rest(
         seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal),
@@ -235,7 +238,8 @@ def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
     # The lag is the one by which the tip's way fits the goal's best.
     lags = range(min(round(MOST_LAG_S / dt_s), max(len(goal) for _, goal in ways) - 1) + 1)
     means = [float(np.nanmean(away_mm(lag))) for lag in lags]
-    best, now = int(np.argmin(means)), away_mm(0)
+    best = int(np.argmin(means))
+    now = away_mm(0)
     return {
         "way_mm": means[0],
         "way_95_mm": float(np.nanquantile(now, 0.95)),
@@ -272,10 +276,14 @@ def write_accuracy(
         return "no picture: matplotlib is not installed"
     figure = Figure(figsize=(10, 4), layout="constrained")
     above, side, shares = figure.subplots(1, 3)
-    seen, style, of_what = accuracy.goal[:, :3] + accuracy.error[:, :3], ".", "goals"
+    seen = accuracy.goal[:, :3] + accuracy.error[:, :3]
+    style = "."
+    of_what = "goals"
     off = accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3]
     if ways:
-        seen, style, of_what = np.concatenate([tip for tip, _ in ways]), "-", "time"
+        seen = np.concatenate([tip for tip, _ in ways])
+        style = "-"
+        of_what = "time"
         off = seen - np.concatenate([goal for _, goal in ways])
     for axes, (i, j) in ((above, (0, 1)), (side, (0, 2))):
         axes.plot(accuracy.goal[:, i], accuracy.goal[:, j], "o", mfc="none", label="goal")
@@ -322,7 +330,9 @@ def print_run(run: LoopRun, policy: Policy) -> None:
 def print_figures(numbers: dict[str, Any]) -> None:
     """Print the figures of an accuracy."""
     for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
-        mean, high, most = numbers[f"{name}_{unit}"], numbers[f"{name}_95_{unit}"], numbers[most]
+        mean = numbers[f"{name}_{unit}"]
+        high = numbers[f"{name}_95_{unit}"]
+        most = numbers[most]
         if np.isnan(mean):  # goals do not ask for it
             continue
         print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")

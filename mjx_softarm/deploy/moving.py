@@ -64,7 +64,8 @@ class ShapeLag(NamedTuple):
         """
         # Difference at rest
         model = policy.estimator
-        base, pose = Frame(model.base_position_m, model.base_rotation), estimate(model, spring_m, load_kg)
+        base = Frame(model.base_position_m, model.base_rotation)
+        pose = estimate(model, spring_m, load_kg)
         uneven = pose_error(np.asarray(pose, float), even_pose(base, model.spring_site_m, spring_m))
         # The arm begins at rest
         if self.uneven is None:
@@ -138,8 +139,11 @@ class Predicting(NamedTuple):
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
         """Act several times; the last references count."""
         # Lengths at the goal, of an arm whose shape lags and that has been beside its way
-        controller, policy, pose = belief.controller, belief.controller.policy, belief.pose
-        shift, length_m = self.shift, belief.spring_m
+        controller = belief.controller
+        policy = belief.controller.policy
+        pose = belief.pose
+        shift = self.shift
+        length_m = belief.spring_m
         way = self.way.advance(goal, pose - self.behind, controller)
         goal = goal + self.behind + way.correction
         for _ in range(policy.n_actions):
@@ -171,7 +175,8 @@ class Chasing(NamedTuple):
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
         """Act from the pose in motion towards the goal, corrected by its error on the way."""
-        controller, policy = belief.controller, belief.controller.policy
+        controller = belief.controller
+        policy = belief.controller.policy
         load_kg = belief.load.believed_kg
         shape, behind = self.shape.advance(policy, belief.spring_m, load_kg, controller.dt_s)
         pose = belief.pose - behind
@@ -216,7 +221,8 @@ def tip_lag_s(controller: Controller) -> float:
     along the line between them, after half a period; the median of several goals.
     """
     policy = controller.policy
-    rng, n_ticks = np.random.default_rng(0), round(_SWING_S * policy.rate_hz)
+    rng = np.random.default_rng(0)
+    n_ticks = round(_SWING_S * policy.rate_hz)
     low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     phase = 2.0 * np.pi * np.arange(3 * n_ticks // 2) / n_ticks
 
@@ -242,7 +248,9 @@ def _tip_path(controller: Controller, pressure_kpa: np.ndarray, goals: np.ndarra
     have the volumes of the straight arm.
     """
     # The arm at rest
-    policy, spec, dt_s = controller.policy, controller.policy.spec, controller.dt_s
+    policy = controller.policy
+    spec = controller.policy.spec
+    dt_s = controller.dt_s
     straight_m = spec.at_chambers(spec.geometry.section_length_m)
     air = spec.pneumatics(straight_m, dt_s)
     air.hold(pressure_kpa, straight_m)
@@ -250,7 +258,10 @@ def _tip_path(controller: Controller, pressure_kpa: np.ndarray, goals: np.ndarra
     law = LawState.at_rest(pressure_kpa, spring_m)
 
     # References and pressures of each tick
-    lengths_m, references_m, tip_mm, shape = [spring_m], [spring_m], [], ShapeLag()
+    lengths_m = [spring_m]
+    references_m = [spring_m]
+    tip_mm = []
+    shape = ShapeLag()
     for goal in goals:
         shape, behind = shape.advance(policy, spring_m, 0.0, dt_s)
         at_rest = _pose(policy, spring_m)

@@ -57,7 +57,9 @@ def record(
         tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.
     """
-    rows, hold, rest = Recorder(), _Hold(), []
+    rows = Recorder()
+    hold = _Hold()
+    rest = []
 
     def on_tick(row: dict) -> None:
         hold.add(row, "tip_m" in row or not drive.link.sees)
@@ -65,10 +67,10 @@ def record(
             rows.add(row)
 
     drive = Drive(arm, spec, on_tick)
-    began_s = told_s = time.monotonic()
+    began_s = reported_s = time.monotonic()
 
     def run() -> None:
-        nonlocal told_s
+        nonlocal reported_s
         for k, target_kpa in enumerate(targets_kpa, 1):
             # Drive to the pressures, check the arm, log the pose.
             hold.ticks.clear()
@@ -77,12 +79,12 @@ def record(
             if rest[-1] and not transients:
                 rows.add(_mean(hold.last_second()))
 
-            # Tell the progress.
+            # Report the progress.
             now_s = time.monotonic()
-            if now_s - told_s >= PROGRESS_S or k == len(targets_kpa):
+            if now_s - reported_s >= PROGRESS_S or k == len(targets_kpa):
                 left_min = (now_s - began_s) / k * (len(targets_kpa) - k) / 60
                 tell(f"{k} of {len(targets_kpa)} poses, about {left_min:.1f} min left")
-                told_s = now_s
+                reported_s = now_s
 
     def log() -> Log:
         return rows.log("record", drive.sensor)
@@ -148,7 +150,8 @@ class _Hold:
         least_kpa = np.maximum(STUCK_PRESSURE_KPA, LOST_SHARE * np.abs(target_kpa))
         off = np.abs(kpa[-1] - target_kpa) > least_kpa
         if (k := np.flatnonzero(off)).size:
-            got, wanted = kpa[-1, k[0]], target_kpa[k[0]]
+            got = kpa[-1, k[0]]
+            wanted = target_kpa[k[0]]
             raise ArmFault(f"pressures: chamber{k[0]}: got {got:.1f} kPa at rest, expected {wanted:.1f} kPa")
 
 

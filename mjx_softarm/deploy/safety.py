@@ -83,7 +83,8 @@ class Fault(Enum):
 
     def __new__(cls, text: str, response: Response) -> Fault:
         fault = object.__new__(cls)
-        fault._value_, fault.response = text, response
+        fault._value_ = text
+        fault.response = response
         return fault
 
 
@@ -151,7 +152,8 @@ def _payload_faults(last: Belief, belief: Belief) -> Iterator[Event]:
     """Yield the faults of a payload that was estimated in this tick."""
     if belief.estimate_kg is None:
         return
-    load, most_kg = belief.load, float(belief.controller.policy.load_estimator.load_scale_kg)
+    load = belief.load
+    most_kg = float(belief.controller.policy.load_estimator.load_scale_kg)
     believed = f"the pose is estimated with {1e3 * load.believed_kg:.0f} g"
     if not holds_payload(belief.estimate_kg, belief.width_kg, most_kg):
         text = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g, {believed}"
@@ -179,8 +181,12 @@ def extrapolated(belief: Belief) -> tuple[Event, ...]:
 def unsettled(belief: Belief) -> tuple[Event, ...]:
     """Return the faults of the springs as they stand before the next action."""
     # Errors at the chambers: springs of an arm with redundant chambers cannot all be on any references
-    controller, command, mask, events = belief.controller, belief.command, belief.saturated, []
-    off_m, allocation = belief.mean_m - command.reference_m, controller.policy.gains.allocation
+    controller = belief.controller
+    command = belief.command
+    mask = belief.saturated
+    events = []
+    off_m = belief.mean_m - command.reference_m
+    allocation = controller.policy.gains.allocation
     if allocation is not None:
         off_m = -allocated_error(-off_m, command.pressure_kpa, allocation)
 

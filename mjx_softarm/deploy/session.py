@@ -136,7 +136,8 @@ def steer(
         look: takes the state after each tick and the row that it logged; may not wait.
         tell, save: as for `follow`.
     """
-    goals, kept = OrderedGoals(controller, orders), None if save else _KEPT
+    goals = OrderedGoals(controller, orders)
+    kept = None if save else _KEPT
     session = _Session(arm, controller, goals, tell, look=look, kept=kept)
     return session.to_end(save or (lambda log: None))
 
@@ -154,11 +155,15 @@ class _Session:
         look: Callable[[LoopState, dict[str, Any]], None] = lambda state, row: None,
         kept: int | None = None,
     ):
-        self.controller, self.goals = controller, goals
-        self.tell, self.arrived, self.look = tell, arrived, look
+        self.controller = controller
+        self.goals = goals
+        self.tell = tell
+        self.arrived = arrived
+        self.look = look
         self.state = start(controller)
         self.nothing = np.full(controller.policy.spec.n_springs, np.nan)
-        self.link, self.rows = Link(arm, controller.policy.spec, controller.dt_s), Recorder(kept)
+        self.link = Link(arm, controller.policy.spec, controller.dt_s)
+        self.rows = Recorder(kept)
         self.arrivals: deque[Arrival] = deque(maxlen=kept)
         self.events: deque[Event] = deque(maxlen=kept)
         self.latency_s: deque[float] = deque(maxlen=kept)
@@ -168,7 +173,9 @@ class _Session:
     def to_end(self, save: Callable[[Log], None]) -> LoopRun:
         """Run, vent and save the log; return the results."""
         ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
-        arrivals, events, latency_s = tuple(self.arrivals), tuple(self.events), np.array(self.latency_s)
+        arrivals = tuple(self.arrivals)
+        events = tuple(self.events)
+        latency_s = np.array(self.latency_s)
         return LoopRun(
             self.log(), arrivals, events, latency_s, ending, self.goals.n_goals, tuple(self.goals.ways)
         )
@@ -237,7 +244,8 @@ class _Session:
         return in_time
 
     def _log(self, row: dict[str, Any]) -> None:
-        belief, reference_m = self.state.belief, self.state.command.reference_m
+        belief = self.state.belief
+        reference_m = self.state.command.reference_m
         row["estimate"], row["load_kg"] = belief.pose, belief.load.believed_kg
         row["reference_m"] = self.nothing if reference_m is None else reference_m
         self.rows.add(row)

@@ -75,7 +75,8 @@ class AtRest(NamedTuple):
             return None, None, events
 
         # Shifts that take all, or a share, of the error that the references leave.
-        shifts, allowed = [self.shift], None
+        shifts = [self.shift]
+        allowed = None
         if belief.settled:
             pose, left = _remaining_error(self, belief, goal)
             shifts = [clipped(self.shift - share * left) for share in SHARES]
@@ -146,7 +147,8 @@ def observed(belief: Belief, last_m: np.ndarray | None = None) -> np.ndarray | N
 
     `last_m` (n_springs,) [m] are the last references, by default those in force.
     """
-    controller, lengths_m = belief.controller, belief.window.spring_m
+    controller = belief.controller
+    lengths_m = belief.window.spring_m
     last_m = belief.command.reference_m if last_m is None else last_m
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
     last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
@@ -161,8 +163,12 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
     The goal is shifted by a share of the error that the references would leave at rest, several times. Those
     that would leave the least count.
     """
-    controller, policy = belief.controller, belief.controller.policy
-    seen, shift, least, best_m = observed(belief), np.zeros(6), np.inf, belief.spring_m
+    controller = belief.controller
+    policy = belief.controller.policy
+    seen = observed(belief)
+    shift = np.zeros(6)
+    least = np.inf
+    best_m = belief.spring_m
     for _ in range(1 + N_CORRECTIONS):
         reference_m = controller.plan(belief.pose, goal + shift, belief.spring_m, seen)
         pose = np.asarray(pose_of(controller, reference_m, belief.load)[0], float)
@@ -190,7 +196,8 @@ def _remaining_error(strategy: AtRest, belief: Belief, goal: np.ndarray) -> tupl
 
 def _pose_made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     """Return the pose (6,) [mm, deg] of an arm at rest on its last references, moved to others."""
-    asked_m, policy = belief.command.reference_m, belief.controller.policy
+    asked_m = belief.command.reference_m
+    policy = belief.controller.policy
     assert asked_m is not None
     spring_m = followed(reference_m, belief.mean_m, asked_m, belief.saturated, policy)
     return np.asarray(pose_of(belief.controller, spring_m, load)[0], float)

@@ -12,7 +12,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import TOLERANCE_M
 from mjx_softarm.mdp.observation import Observation
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.mechanics.pipe import Contact, CrossPipe
+from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.spec import ArmSpec
 
@@ -78,8 +78,6 @@ class EnvConfig:
     0.02 by mjx"""
     pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
     """cross-shaped pipe around the arm"""
-    pipe_contact: bool = False
-    """the wall acts on the simulated arm; else it is there for clearances alone"""
     clearance_cost_per_mm: float = 0.0  # cost per mm of clearance below the margin
     clearance_margin_mm: float = 10.0  # clearance of the body to the wall from which there is no cost
 
@@ -87,10 +85,6 @@ class EnvConfig:
     def pipe(self) -> CrossPipe | None:
         """Pipe around the arm, if there is one."""
         return None if self.pipe_diameter_mm is None else CrossPipe.of_mm(self.pipe_diameter_mm)
-
-    def contact(self, spec: ArmSpec) -> Contact | None:
-        """Return the contact of an arm with the pipe, if its wall acts."""
-        return Contact.of(self.pipe, spec) if self.pipe and self.pipe_contact else None
 
     @property
     def moves(self) -> bool:
@@ -152,15 +146,7 @@ class EnvConfig:
         _expect(self.randomisation, "friction_max_n", no_friction, "0 with the engine 'warp'")
 
         # Pipe
-        for name in ("clearance_cost_per_mm", "pipe_contact"):
-            without = self.pipe_diameter_mm is not None or not getattr(self, name)
-            _expect(self, name, without, f"{type(getattr(self, name))()!r} without a pipe_diameter_mm")
-        other_engine = self.engine != ("mjx" if self.moves else "chain")
-        _expect(
-            self,
-            "pipe_contact",
-            not (self.pipe_contact and other_engine),
-            f"False with the engine {self.engine!r} and the mode {self.mode!r}",
-        )
+        free = self.pipe_diameter_mm is not None or not self.clearance_cost_per_mm
+        _expect(self, "clearance_cost_per_mm", free, "0.0 without a pipe_diameter_mm")
         if self.pipe_diameter_mm is not None:
             CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError

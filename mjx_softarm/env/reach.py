@@ -80,7 +80,6 @@ class ReachEnv(brax_envs.Env):
         self.episode_motion = EpisodeMotion(self.spec, self.config)
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *jax.device_put([np.float32(limit) for limit in limits]))
-        self.params = self.params._replace(contact=self.config.contact(self.spec))
         self.walls = Walls(self.config.pipe, self.spec, self.params, s2r)
 
         # Simulation, and the poses that starts and goals are drawn from

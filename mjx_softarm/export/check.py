@@ -65,7 +65,8 @@ def compare(golden: Golden, rows: np.ndarray, outputs: dict[str, np.ndarray]) ->
     worst = Agreement(len(rows), 0.0, "none", 0)
     for name, got in outputs.items():
         column = names.index(name)
-        expected, scale = golden.outputs[rows, column], golden.about["range"][column]
+        expected = golden.outputs[rows, column]
+        scale = golden.about["range"][column]
         off = np.abs(got - expected)
         if name in ("pose_yaw", "pose_pitch", "pose_roll"):
             off = np.minimum(off, 360.0 - off)
@@ -143,7 +144,8 @@ def _checked(
     golden: Golden, outside: Callable[[np.ndarray], bool]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the golden rows with checked goals, and their faults; `outside` decides GOAL_OUTSIDE."""
-    rows, bit = np.flatnonzero(golden.inputs[:, FLAGS.index("checked")]), BITS[Fault.GOAL_OUTSIDE]
+    rows = np.flatnonzero(golden.inputs[:, FLAGS.index("checked")])
+    bit = BITS[Fault.GOAL_OUTSIDE]
     bits = np.array([bit * outside(goal) for goal in golden.inputs[rows, -6:].astype(np.float32)], int)
     return rows, {"faults": golden.outputs[rows, 0].astype(int) & ~bit | bits}
 
@@ -152,7 +154,8 @@ def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.nd
     # Run the program.
     lines = [" ".join(f"{value:.9g}" for value in row) for row in golden.inputs]
     try:
-        command, text = [str(path.resolve())], "\n".join([*lines, ""])
+        command = [str(path.resolve())]
+        text = "\n".join([*lines, ""])
         done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S)
     except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError) as error:
         raise InputError(f"{path}: got {error}, expected a program that runs") from error

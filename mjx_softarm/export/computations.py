@@ -41,9 +41,9 @@ def graph(controller: Controller) -> Computation:
     inputs = symbol("readings", springs), symbol("goal", (6,)), symbol("last_length_m", springs)
     inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", chambers), symbol("stop", chambers)
     motion = _in_motion(spec)
-    found = answer(controller, *inputs, motion)
+    outputs = answer(controller, *inputs, motion)
     inputs += tuple(motion) if controller.policy.observation == "motion" else ()
-    return Computation(inputs, {name: constant(value) for name, value in found.items()})
+    return Computation(inputs, {name: constant(value) for name, value in outputs.items()})
 
 
 def answer(
@@ -68,7 +68,7 @@ def answer(
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
     stop = hysteresis_after(policy, stop, last_m, reading.length_m)
-    told_kg, half_width_kg = estimate_load(policy.load_estimator, reading.length_m, pressure_kpa, stop)
+    estimated_kg, half_width_kg = estimate_load(policy.load_estimator, reading.length_m, pressure_kpa, stop)
     pose, away = tip_pose(policy, reading.length_m, load_kg)
     observed = sensed(policy, pose, reading.length_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
@@ -84,7 +84,7 @@ def answer(
         "pose": pose,
         "extrapolation": away,
         "goal_outside": ~inside,
-        "load_estimate_kg": told_kg,
+        "load_estimate_kg": estimated_kg,
         "load_half_width_kg": half_width_kg,
         "next_stop": stop,
     }
@@ -139,77 +139,91 @@ class _Inputs(NamedTuple):
 
 def parts(controller: Controller) -> dict[str, Computation]:
     """Record the functions of which `mjx_softarm.deploy.loop` consists, by their names in C++."""
-    at = _Inputs.of(controller)
-    return _acting_parts(controller, at) | _judging_parts(controller, at) | _search_parts(controller, at)
+    inputs = _Inputs.of(controller)
+    return (
+        _acting_parts(controller, inputs)
+        | _judging_parts(controller, inputs)
+        | _search_parts(controller, inputs)
+    )
 
 
-def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]:
+def _acting_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computation]:
     """Record lengths, payload, pose, references and pressures."""
     # Belief.
-    policy, xp = controller.policy, array_namespace(at.readings)
-    reading = policy.sensor.lengths(at.readings, at.spring_m)
-    tip, away = tip_pose(policy, at.spring_m, at.load_kg)
-    means = xp.mean(at.springs_m, axis=0), xp.mean(at.pressures_kpa, axis=0)
-    told_kg, half_width_kg = estimate_load(policy.load_estimator, *means, at.stop)
-    last_m = symbol("last_m", at.spring_m.shape)
-    next_stop = hysteresis_after(policy, at.stop, last_m, at.spring_m)
+    policy, xp = controller.policy, array_namespace(inputs.readings)
+    reading = policy.sensor.lengths(inputs.readings, inputs.spring_m)
+    tip, away = tip_pose(policy, inputs.spring_m, inputs.load_kg)
+    means = xp.mean(inputs.springs_m, axis=0), xp.mean(inputs.pressures_kpa, axis=0)
+    estimated_kg, half_width_kg = estimate_load(policy.load_estimator, *means, inputs.stop)
+    last_m = symbol("last_m", inputs.spring_m.shape)
+    next_stop = hysteresis_after(policy, inputs.stop, last_m, inputs.spring_m)
     # Policy.
     motion = _in_motion(policy.spec)
-    observed = sensed(policy, at.pose, at.spring_m, motion, at.load_kg)
-    action = action_towards(policy, at.pose, xp.asarray(at.goal, dtype=np.float32), observed)
+    observed = sensed(policy, inputs.pose, inputs.spring_m, motion, inputs.load_kg)
+    action = action_towards(policy, inputs.pose, xp.asarray(inputs.goal, dtype=np.float32), observed)
     # Law.
     sizes = policy.spec.n_chambers, policy.spec.n_springs, policy.spec.n_springs
     state = LawState(*(symbol(f"last_{name}", (n,)) for name, n in zip(LawState._fields, sizes, strict=True)))
-    written_kpa, after = pressures(at.reference_m, at.spring_m, state, policy.gains, controller.dt_s)
-    law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
-    acting = at.pose, at.goal, at.spring_m, *motion, at.load_kg
+    written_kpa, next_state = pressures(
+        inputs.reference_m, inputs.spring_m, state, policy.gains, controller.dt_s
+    )
+    law = {"written_kpa": written_kpa} | {
+        f"next_{name}": value for name, value in next_state._asdict().items()
+    }
+    acting = inputs.pose, inputs.goal, inputs.spring_m, *motion, inputs.load_kg
     return {
-        "lengths": _of(at.readings, at.spring_m, length_m=reading.length_m, lost=_lost(reading)),
-        "mean_length": _of(at.springs_m, mean_m=means[0]),
-        "hysteresis": _of(at.stop, last_m, at.spring_m, next_stop=next_stop),
-        "estimated_load": _of(at.springs_m, at.pressures_kpa, at.stop, kg=told_kg, width_kg=half_width_kg),
-        "tip": _of(at.spring_m, at.load_kg, tip=tip, away=constant(away)),
+        "lengths": _of(inputs.readings, inputs.spring_m, length_m=reading.length_m, lost=_lost(reading)),
+        "mean_length": _of(inputs.springs_m, mean_m=means[0]),
+        "hysteresis": _of(inputs.stop, last_m, inputs.spring_m, next_stop=next_stop),
+        "estimated_load": _of(
+            inputs.springs_m, inputs.pressures_kpa, inputs.stop, kg=estimated_kg, width_kg=half_width_kg
+        ),
+        "tip": _of(inputs.spring_m, inputs.load_kg, tip=tip, away=constant(away)),
         "references": _of(*acting, asked_m=policy.actions.lengths(action)),
-        "law": _of(at.reference_m, at.spring_m, *state, **law),
-        "vented": _of(at.pressure_kpa, next_kpa=vented(at.pressure_kpa, controller.dt_s)),
+        "law": _of(inputs.reference_m, inputs.spring_m, *state, **law),
+        "vented": _of(inputs.pressure_kpa, next_kpa=vented(inputs.pressure_kpa, controller.dt_s)),
     }
 
 
-def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]:
+def _judging_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computation]:
     """Record rest, faults, and the way that remains."""
     # Rest and faults.
     policy, rest = controller.policy, controller.rest
-    gains, xp = policy.gains, array_namespace(at.pose)
-    settled = on_reference(at.springs_m, at.reference_m, at.pressure_kpa, gains, rest.arrived_m)
-    mask = saturated(at.pressure_kpa, at.reference_m, at.spring_m, gains, policy.tolerance_m)
-    stuck = stuck_springs(at.springs_m, at.pressures_kpa, policy.spec.structure.n_sections)
-    lost = explained_by_pressure_loss(policy.spring_model, at.pressure_kpa, at.spring_m, gains.allocation)
+    gains, xp = policy.gains, array_namespace(inputs.pose)
+    settled = on_reference(inputs.springs_m, inputs.reference_m, inputs.pressure_kpa, gains, rest.arrived_m)
+    mask = saturated(inputs.pressure_kpa, inputs.reference_m, inputs.spring_m, gains, policy.tolerance_m)
+    stuck = stuck_springs(inputs.springs_m, inputs.pressures_kpa, policy.spec.structure.n_sections)
+    lost = explained_by_pressure_loss(
+        policy.spring_model, inputs.pressure_kpa, inputs.spring_m, gains.allocation
+    )
     # Error of a pose, and lengths that references make.
-    pose = xp.asarray(at.pose, dtype=np.float64)
-    weighted = weighted_error(pose, at.goal, policy.reward)
-    mean_m, asked_m = (symbol(name, at.spring_m.shape) for name in ("mean_m", "asked_m"))
-    moved = at.reference_m, mean_m, asked_m, symbol("is_saturated", at.pressure_kpa.shape, bool)
+    pose = xp.asarray(inputs.pose, dtype=np.float64)
+    weighted = weighted_error(pose, inputs.goal, policy.reward)
+    mean_m, asked_m = (symbol(name, inputs.spring_m.shape) for name in ("mean_m", "asked_m"))
+    lengths = inputs.reference_m, mean_m, asked_m, symbol("is_saturated", inputs.pressure_kpa.shape, bool)
     return {
-        "still": _of(at.springs_m, holds=still(at.springs_m, rest.still_m)),
-        "on_reference": _of(at.springs_m, at.reference_m, at.pressure_kpa, holds=settled),
-        "saturated": _of(at.pressure_kpa, at.reference_m, at.spring_m, mask=mask),
-        "stuck": _of(at.springs_m, at.pressures_kpa, mask=stuck),
-        "as_without": _of(at.pressure_kpa, at.spring_m, mask=lost),
-        "left": _of(at.pose, at.goal, off=asked_error(pose, at.goal, policy.reward), error=weighted),
-        "followed": _of(*moved, lengths_m=followed(*moved, policy)),
+        "still": _of(inputs.springs_m, holds=still(inputs.springs_m, rest.still_m)),
+        "on_reference": _of(inputs.springs_m, inputs.reference_m, inputs.pressure_kpa, holds=settled),
+        "saturated": _of(inputs.pressure_kpa, inputs.reference_m, inputs.spring_m, mask=mask),
+        "stuck": _of(inputs.springs_m, inputs.pressures_kpa, mask=stuck),
+        "explained_by_pressure_loss": _of(inputs.pressure_kpa, inputs.spring_m, mask=lost),
+        "left": _of(
+            inputs.pose, inputs.goal, off=asked_error(pose, inputs.goal, policy.reward), error=weighted
+        ),
+        "followed": _of(*lengths, lengths_m=followed(*lengths, policy)),
     }
 
 
-def _search_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]:
+def _search_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computation]:
     """Record the tests of a goal: among reachable poses, and by a search."""
-    policy, goal, start = controller.policy, at.goal, constant(reach.begin(controller.policy, 1))
+    policy, goal, start = controller.policy, inputs.goal, constant(reach.begin(controller.policy, 1))
     search = symbol("search", start.shape)
-    found, error = reach.nearest_of(policy, goal[None], search)
+    nearest, error = reach.nearest_of(policy, goal[None], search)
     return {
         "inside": _of(goal, holds=_inside(controller, goal)),
         "search_begin": _of(search=start),
         "search_step": _of(goal, search, next=reach.improve(policy, goal[None], search)),
-        "search_end": _of(search, goal, nearest=found[0], error=error[0]),
+        "search_end": _of(search, goal, nearest=nearest[0], error=error[0]),
     }
 
 

@@ -223,7 +223,8 @@ class _Namespace:
         return getattr(self, name)
 
     def __getattr__(self, name: str) -> Any:
-        plain, known = getattr(np, name), _OTHER_NAMES.get(name, name)
+        plain = getattr(np, name)
+        known = _OTHER_NAMES.get(name, name)
         if not callable(plain) or isinstance(plain, type):  # a number or a type
             return plain
 

@@ -32,7 +32,8 @@ def export_onnx(policy_path: Path) -> list[Path]:
         from mjx_softarm.export.onnx_files import write_onnx
     # Inputs that may be left out, with their defaults.
     controller, sha256 = _open(policy_path)
-    spec, about = controller.policy.spec, describe(controller.policy, sha256)
+    spec = controller.policy.spec
+    about = describe(controller.policy, sha256)
     whole, actor, check = (
         policy_path.with_name(f"{policy_path.stem}{end}.onnx") for end in ("", "_actor", "_check")
     )

@@ -26,15 +26,6 @@ def ring_radius_m(spec: ArmSpec) -> np.ndarray:
     return np.maximum(np.append(of_links[0], of_links), np.append(of_links, of_links[-1])) + SPRING_WIDTH_M
 
 
-def ball_rings(spec: ArmSpec) -> np.ndarray:
-    """Mask (n_links + 1,) the rings that a ball as wide stands for where the arm touches.
-
-    Near the tip a ball would reach past the gripper.
-    """
-    below_m = np.append(np.cumsum(spec.link_length_m[::-1])[::-1], 0.0)  # depth of the tip below each ring
-    return below_m >= ring_radius_m(spec)
-
-
 def chamber_directions(spec: ArmSpec) -> np.ndarray:
     """Return the unit vectors (n_sections, c, 2), x and y, from the axis of a section to its chambers."""
     n = spec.structure.chambers_per_section

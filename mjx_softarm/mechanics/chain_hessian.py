@@ -1,11 +1,10 @@
 """The Hessian of a chain of sections, and systems with it, each solved at a cost linear in the sections.
 
-Tendons couple the joints of one section; only gravity and contact couple joints of different sections. The
-second derivative of gravity by a joint i and a joint j further down is a product of two numbers of i with two
-numbers of j (see `mjx_softarm.mechanics.statics`), so the block between two sections has rank two. Contact
-with a wall adds six (see `mjx_softarm.mechanics.contact`). Block elimination from the tip to the base keeps
-that form: the sections below act on a section as a reaction of this rank, as in the articulated-body
-algorithm for rigid chains.
+Tendons couple the joints of one section; only gravity couples joints of different sections. The second
+derivative of gravity by a joint i and a joint j further down is a product of two numbers of i with two
+numbers of j (see `mjx_softarm.mechanics.statics`), so the block between two sections has rank two. Block
+elimination from the tip to the base keeps that form: the sections below act on a section as a reaction of
+this rank, as in the articulated-body algorithm for rigid chains.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapter 7 (articulated bodies).
 """

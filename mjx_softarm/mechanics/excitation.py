@@ -26,7 +26,8 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
         seed: seed of the draw, or a generator.
     """
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    rng, n = np.random.default_rng(seed), spec.structure.chambers_per_section
+    rng = np.random.default_rng(seed)
+    n = spec.structure.chambers_per_section
     swing = np.cos(rng.uniform(0.0, np.pi, (n_poses, spec.n_chambers)))
     if n > 3:
         swing[::2] = _plane_swings(n, len(swing[::2]) * spec.structure.n_sections, rng).reshape(
@@ -52,10 +53,12 @@ def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
     reaches every point with 2 kPa to spare in each chamber. An arm without vacuum is seldom shorter than at
     rest, so its circle is lower; those that ship then have 8 kPa to spare.
     """
-    angle, size = 2 * np.pi * np.arange(n) / n, spec.length_m / 0.6
+    angle = 2 * np.pi * np.arange(n) / n
+    size = spec.length_m / 0.6
     evacuated = spec.chambers.pressure_min_kpa < 0.0
     height_mm = CIRCLE_HEIGHT_MM * size if evacuated else -1e3 * WITHOUT_VACUUM * spec.length_m
-    radius, height = 0.5 * CIRCLE_DIAMETER_MM * size, np.full(n, height_mm)
+    radius = 0.5 * CIRCLE_DIAMETER_MM * size
+    height = np.full(n, height_mm)
     place_mm = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
     return turned_poses(spec, place_mm).astype(np.float32)
 

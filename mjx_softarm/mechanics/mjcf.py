@@ -49,7 +49,9 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     mjspec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     mjspec.visual.headlight.diffuse = [0.55, 0.55, 0.55]
     sky = mjspec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
-    sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [1.0] * 3, [0.82, 0.86, 0.9]
+    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    sky.rgb1 = [1.0] * 3
+    sky.rgb2 = [0.82, 0.86, 0.9]
 
     # The chain from the base to the tools, mounted as the specification says, then its tendons
     world = body = mjspec.worldbody
@@ -111,7 +113,9 @@ def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     mass = float(params.link_mass_kg[link])
     radius = spec.per_section(spec.geometry.spring_radius_m)[section]
     sideways = mass * (3 * radius**2 + (2 * half) ** 2) / 12
-    body.mass, body.ipos, body.explicitinertial = mass, [0.0, 0.0, 0.0], True
+    body.mass = mass
+    body.ipos = [0.0, 0.0, 0.0]
+    body.explicitinertial = True
     body.inertia = [sideways, sideways, mass * radius**2 / 2]
 
     # Joints: a section's backbone is `links_per_section` links in series
@@ -157,14 +161,17 @@ def _add_holes(body, plate: int, section: int, position, params: ArmParams) -> N
 
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
     """Add gripper and payload below the last plate, and the measured tip on it."""
-    half, length = 0.5 * spec.link_length_m[-1], spec.mass.gripper_length_m
+    half = 0.5 * spec.link_length_m[-1]
+    length = spec.mass.gripper_length_m
     tip = last.add_site(name="tip", size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
     tip.pos = np.asarray(params.mount.tip_offset_m) - [0.0, 0.0, half]
     tip.quat = quaternion_from_rotation(params.mount.tip_rotation)
     for k, name in enumerate(("gripper", "payload")):
         tool = last.add_body(name=name, pos=[0.0, 0.0, -half - float(params.tool_offset_m[k])])
         mass = float(params.tool_mass_kg[k])
-        tool.mass, tool.ipos, tool.explicitinertial = mass, [0.0, 0.0, 0.0], True
+        tool.mass = mass
+        tool.ipos = [0.0, 0.0, 0.0]
+        tool.explicitinertial = True
         tool.inertia = [mass * length**2 / 12] * 3
         boxes = gripper_boxes(spec).items() if name == "gripper" else ()
         for box, (size, position) in boxes:
@@ -206,12 +213,14 @@ def _add_spring(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmS
     tendon.stiffness = _polynomial(float(params.spring_stiffness[index]))
     tendon.damping = _polynomial(spec.per_section(spec.springs.damping_ns_per_m)[section])
     tendon.springlength = [float(params.spring_rest_m[index])] * 2
-    tendon.width, tendon.rgba = SPRING_WIDTH_M, _SPRING_COLOUR
+    tendon.width = SPRING_WIDTH_M
+    tendon.rgba = _SPRING_COLOUR
 
 
 def _add_tendon(mjspec: mujoco.MjSpec, name: str, section: int, spec: ArmSpec) -> mujoco.MjsTendon:
     """Add a tendon through all rings of a section."""
-    tendon, per_section = mjspec.add_tendon(name=name), spec.structure.links_per_section
+    tendon = mjspec.add_tendon(name=name)
+    per_section = spec.structure.links_per_section
     for plate in range(section * per_section, (section + 1) * per_section + 1):
         tendon.wrap_site(f"{name}_plate{plate}")
     return tendon

@@ -12,7 +12,6 @@ from jax import Array
 from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.control import Allocation, allocation
 from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_directions
-from mjx_softarm.mechanics.pipe import Contact
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
@@ -20,8 +19,6 @@ from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec, bonded_stiffness
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
-
-jax.tree_util.register_static(Contact)
 
 
 class Mount(NamedTuple):
@@ -64,7 +61,6 @@ class ArmParams(NamedTuple):
     pressure_max_kpa: Array  # (n_chambers,)
     mount: Mount
     allocation: Allocation | None = None  # of arms with redundant chambers, see `mjx_softarm.control`
-    contact: Contact | None = None  # with the wall of a pipe around the arm
 
     @property
     def n_sections(self) -> int:
@@ -109,8 +105,10 @@ class ArmParams(NamedTuple):
         back by 9 % more with a share of 0.9.
         """
         # Stiffness that each chamber of a section gives
-        xp, (n_sections, c, _) = array_namespace(self.chamber_stiffness), self.chamber_site_m.shape
-        stiffness, free_m = self.chamber_stiffness.reshape(n_sections, c), self.free_length_m
+        xp = array_namespace(self.chamber_stiffness)
+        n_sections, c, _ = self.chamber_site_m.shape
+        stiffness = self.chamber_stiffness.reshape(n_sections, c)
+        free_m = self.free_length_m
         square_m2 = xp.mean(xp.sum(self.chamber_site_m**2, axis=-1), axis=1)
         given, axial, bend = bonded_stiffness(share, stiffness, square_m2)  # (n_sections,) each
         left = (stiffness - given[:, None]).reshape(-1)
@@ -135,7 +133,8 @@ class ArmParams(NamedTuple):
         """Return the numbers of `spec`, in SI units but for the pressures [kPa]."""
         # A section's backbone is `links_per_section` links in series
         geometry, backbone, chambers = spec.geometry, spec.backbone, spec.chambers
-        per_section, n = spec.structure.links_per_section, spec.n_chambers
+        per_section = spec.structure.links_per_section
+        n = spec.n_chambers
         axial = np.array(spec.per_section(backbone.axial_stiffness_n_per_m)) * per_section
         bending = np.array(spec.per_section(backbone.bending_stiffness_nm_per_rad)) * per_section
         joints = np.stack([axial, bending, bending], axis=-1)  # (n_sections, 3)
@@ -182,6 +181,7 @@ def _law_stiffness(spec: ArmSpec) -> np.ndarray:
 def _mount(spec: ArmSpec, dtype: np.typing.DTypeLike) -> Mount:
     """Return the mount of `spec`; raise SpecError where `check_posture` does."""
     check_posture(spec)
-    mounting, tip = spec.mounting, rotation_about(np.radians(spec.mounting.tip_turn_deg))
+    mounting = spec.mounting
+    tip = rotation_about(np.radians(mounting.tip_turn_deg))
     values = (mounting.base_offset_m, base_rotation(spec), mounting.tip_offset_m, tip)
     return Mount(*(np.asarray(value, dtype) for value in values))

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.mechanics.body import ball_rings, gripper_boxes, rim_points, ring_radius_m
+from mjx_softarm.mechanics.body import gripper_boxes, rim_points, ring_radius_m
 from mjx_softarm.spec import ArmSpec
 
 # Objects that the arm picks and places. Source: the paper's section on confined scenarios.
 BALL_KG = 0.035  # a sponge ball
 APPLE_KG = 0.220
-RIM_BALLS, RIM_BALL_M = 8, 0.01  # balls that stand for a ring near the tip, and their radius
 RIM_POINTS = 16  # points of a ring; its rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
 
 
@@ -27,12 +27,15 @@ RIM_POINTS = 16  # points of a ring; its rim is at most 1 - cos(pi / 16) = 1.9 %
 class CrossPipe:
     """Cross-shaped pipe in the base frame; its axes cross at x = y = 0."""
 
+    centre_z_m: ClassVar[float] = -0.55
+    branch_m: ClassVar[float] = 0.3  # from the centre to the outlets left, right and at the bottom
+    top_z_m: ClassVar[float] = 0.0  # the outlet that the arm enters, level with its base
+    reach_m: ClassVar[float] = (
+        0.06  # depth of the containers in a branch; the nominal arm reaches 5 mm further
+    )
+    drop_m: ClassVar[float] = 0.05  # height of a branch's axis over the left and the right container
+
     diameter_m: float
-    centre_z_m: float = -0.55
-    branch_m: float = 0.3  # from the centre to the outlets left, right and at the bottom
-    top_z_m: float = 0.0  # the outlet that the arm enters, level with its base
-    reach_m: float = 0.06  # depth of the containers in a branch; the nominal arm reaches 5 mm further
-    drop_m: float = 0.05  # height of a branch's axis over the left and the right container
 
     def __post_init__(self) -> None:
         if not 0.0 < self.radius_m < self.branch_m - self.reach_m:
@@ -65,40 +68,6 @@ PIPES = {
     "pipe250": CrossPipe.of_mm(250.0),
     "pipe200": CrossPipe.of_mm(200.0),
 }
-
-
-@dataclass(frozen=True)
-class Contact:
-    """A pipe, and the balls of the arm that touch it; a constant of compiled programs."""
-
-    pipe: CrossPipe
-    plate: tuple[int, ...]  # (k,) plate that each ball is fixed to, from the base to the tip
-    centre_m: tuple[tuple[float, float, float], ...]  # (k, 3) its centre in the plate's frame
-    radius_m: tuple[float, ...]  # (k,) 0 for a point
-
-    @classmethod
-    def of(cls, pipe: CrossPipe, spec: ArmSpec) -> Contact:
-        """Return the contact of an arm in a pipe; the plate of its base touches nothing."""
-        plate, centre, radius = [], [], []
-        is_ball, ring_m = ball_rings(spec), ring_radius_m(spec)
-        for k in range(1, spec.n_links + 1):
-            balls = np.zeros((1, 3)) if is_ball[k] else rim_points(ring_m[k] - RIM_BALL_M, RIM_BALLS)
-            plate += [k] * len(balls)
-            centre += balls.tolist()
-            radius += [ring_m[k] if is_ball[k] else RIM_BALL_M] * len(balls)
-        corners = _lower_corners(spec)
-        plate += [spec.n_links] * len(corners)
-        centre_m = tuple((x, y, z) for x, y, z in [*centre, *corners])
-        return cls(pipe, tuple(plate), centre_m, (*radius, *[0.0] * len(corners)))
-
-
-def _lower_corners(spec: ArmSpec) -> list[list[float]]:
-    """Return the lower corners (8, 3) of the palm and of both fingers as one, in the last plate's frame."""
-    middle, boxes = np.array([0.0, 0.0, -0.5 * spec.mass.gripper_length_m]), gripper_boxes(spec)
-    signs = np.array([[a, b, -1.0] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
-    palm = boxes["palm"][1] + signs * boxes["palm"][0]
-    fingers = [boxes[f"finger{k}"][1] + signs[2 * k : 2 * k + 2] * boxes[f"finger{k}"][0] for k in range(2)]
-    return (middle + np.concatenate([palm, *fingers])).tolist()
 
 
 def clearance(pipe: CrossPipe, position_m: Array) -> Array:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,14 +31,12 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.errors import Result
 from mjx_softarm._support.small_matrices import eliminate, identity, product, products
 from mjx_softarm.control import YIELD_M_PER_KPA, Allocation
-from mjx_softarm.mechanics.contact import is_jammed, step_share
 from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents, gain_columns
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import Statics, statics
 
 MAX_ITERATIONS = 12
-MAX_ITERATIONS_IN_CONTACT = 36  # balls come to the wall one after another
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0  # c
 MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
 SMALL_STEP = 3e-4  # [m, rad]; Newton's method converges quadratically from here
@@ -55,8 +53,7 @@ class SettleResult(Result):
     OUT_OF_ITERATIONS = 1, "forces or springs are off by more than the tolerance after the last iteration"
     NOT_CONVEX = (
         2,
-        "its energy is not convex there, so it buckles or is stuck beyond an edge of a wall, or its springs "
-        "do not follow its chambers",
+        "its energy is not convex there, so it buckles, or its springs do not follow its chambers",
     )
     NOT_FINITE = 3, "a force or a length is not a finite number"
     UNBALANCED = 4, "MJX's own forces do not balance at the equilibrium of the closed form"
@@ -109,12 +106,13 @@ def settle(params: ArmParams, reference_m: Array, n_at_once: int | None = None) 
         reference_m (n_springs,): spring lengths that the law tracks.
         n_at_once: arms of a `jax.vmap` that settle at once, from `arms_at_once`; None is all of them.
     """
-    return _solver(1, n_at_once)(params, reference_m)[0]
+    return _solver(1, n_at_once)(reference_m, params)[0]
 
 
 def _settle_jvp(n_at_once: int | None, primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
     # A second small step brings the response, which is that before the last step, up to date
-    settled, equilibrium = _solver(2, n_at_once)(*primals)
+    params, reference_m = primals
+    settled, equilibrium = _solver(2, n_at_once)(reference_m, params)
     with jax.default_matmul_precision("highest"):
         tangent = equilibrium_tangents(primals, tangents, equilibrium, settled.settled)
     none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in settled))
@@ -137,38 +135,16 @@ def settle_pressures(params: ArmParams, pressure_kpa: Array, n_at_once: int | No
 @functools.cache
 def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
     """Return `_solve` for one arm; `jax.vmap` of it puts the arms last, in chunks of `n_at_once`."""
-    solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
-
-    def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
-        if n_at_once and n_at_once < n:
-            solutions = xla.in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
-        else:
-            solutions = _solve_arms_last(n_small, n, batched, *arguments)
-        return solutions, jax.tree.map(lambda _: True, solutions)
-
-    solve.def_vmap(many)
-    return solve
+    return xla.rows_last(functools.partial(_solve, n_small), n_at_once, n_shared=1)
 
 
-def _solve_arms_last(
-    n_small: int, n: int, batched: list[Any], params: ArmParams, reference_m: Array
-) -> _Solution:
-    """Return the solutions of n arms; `batched` is true for arrays that have the arms as first axis."""
-
-    def arms_last(x: Any, is_batched: bool) -> Array:
-        return jnp.moveaxis(x, 0, -1) if is_batched else jnp.asarray(x)[..., None]
-
-    params_batched, reference_batched = batched
-    reference_m = jnp.broadcast_to(arms_last(reference_m, reference_batched), (reference_m.shape[-1], n))
-    solutions = _solve(n_small, jax.tree.map(arms_last, params, params_batched), reference_m)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solutions)
-
-
-def _solve(n_small: int, params: ArmParams, reference_m: Array) -> _Solution:
+def _solve(n_small: int, reference_m: Array, params: ArmParams) -> _Solution:
     """Return the equilibrium after `n_small` small steps and all that its derivative needs; arms are last."""
     # Start: the straight arm, its pressures as close to zero as the limits allow
-    dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
-    nv, n_chambers = params.link_mass_kg.shape[0] * DOFS_PER_LINK, params.area.shape[0]
+    dtype = params.link_length_m.dtype
+    arms = reference_m.shape[1:]
+    nv = params.link_mass_kg.shape[0] * DOFS_PER_LINK
+    n_chambers = params.area.shape[0]
     zeros = functools.partial(jnp.zeros, dtype=dtype)
     start = Iterate(
         q=zeros((nv, *arms)),
@@ -190,7 +166,7 @@ def _solve(n_small: int, params: ArmParams, reference_m: Array) -> _Solution:
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         _, iterate, evaluation = jax.lax.while_loop(
             lambda loop: loop[0],
-            lambda loop: (jnp.any(loop[1].goes_on(n_small, params)), *one_pass(loop[1])),
+            lambda loop: (jnp.any(loop[1].goes_on(n_small)), *one_pass(loop[1])),
             (jnp.array(True), start, nothing),
         )
         return _report(iterate, evaluation, params, reference_m)
@@ -209,12 +185,11 @@ def _report(iterate: Iterate, evaluation: Evaluation, params: ArmParams, referen
     tracking = jnp.max(jnp.where(params.pinned, 0.0, off), axis=0)
 
     # Result, and all fields of the equilibrium; forces balance in an arm that is about to buckle, too
-    convex = iterate.convex if params.contact is None else iterate.convex & ~is_jammed(params.contact, frames)
-    good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M) & convex
+    good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M) & iterate.convex
     numbers = potential.gradient, error, params.law_stiffness
     finite = functools.reduce(jnp.logical_and, (jnp.all(jnp.isfinite(x), axis=0) for x in numbers))
     result = jnp.select(
-        [~finite, good, ~convex],
+        [~finite, good, ~iterate.convex],
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
         SettleResult.OUT_OF_ITERATIONS.value,
     )
@@ -248,10 +223,9 @@ class Iterate(NamedTuple):
     convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
     iteration: Array  # (*arms,) int
 
-    def goes_on(self, n_small: Array | int, params: ArmParams) -> Array:
+    def goes_on(self, n_small: Array | int) -> Array:
         """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
-        most = MAX_ITERATIONS if params.contact is None else MAX_ITERATIONS_IN_CONTACT
-        return (self.n_small < n_small) & (self.iteration < most + n_small - 1)
+        return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
 
 class Evaluation(NamedTuple):
@@ -273,7 +247,8 @@ def _newton_pass(
     joints' response to the law's gain is solved for in the place of a Newton step.
     """
     # Forces and springs at the iterate
-    goes_on, held = iterate.goes_on(n_small, params), iterate.held & ~iterate.at_limit
+    goes_on = iterate.goes_on(n_small)
+    held = iterate.held & ~iterate.at_limit
     is_last = ~jnp.any(goes_on)
     clipped = jnp.clip(iterate.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     pressure = jnp.where(is_last, clipped, iterate.pressure)
@@ -293,7 +268,7 @@ def _newton_pass(
 
     # Step of the arms that go on
     clipped_iterate = iterate._replace(pressure=pressure)
-    stepped = _newton_step(clipped_iterate, frames, potential, solved, params, reference_m)
+    stepped = _newton_step(clipped_iterate, potential, solved, params, reference_m)
     stepped = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), stepped, iterate)
     law_response = solved[:, :, : len(reference_m)].reshape(len(iterate.q), *reference_m.shape)
     return stepped, Evaluation(pressure, frames, potential, law_response)
@@ -301,7 +276,6 @@ def _newton_pass(
 
 def _newton_step(
     iterate: Iterate,
-    frames: Frames,
     potential: Statics,
     solved: Array,
     params: ArmParams,
@@ -311,7 +285,6 @@ def _newton_step(
 
     Args:
         iterate: start of the step.
-        frames: at the iterate.
         potential: forces and springs at the iterate.
         solved (n_sections, n, 1 + n_chambers, *arms): H^-1 [-grad V, B].
         params: numbers of the arm.
@@ -338,11 +311,9 @@ def _newton_step(
     # from now on; if it does already, or none tracks, the joints are stiffer for a step
     largest = jnp.max(jnp.abs(dq), axis=0)
     scale = jnp.minimum(1.0, MAX_STEP / largest)
-    if params.contact is not None:
-        scale = scale * step_share(params.contact, frames, chain_kinematics(params)(iterate.q + scale * dq))
     finite = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
     convex = finite & (iterate.stiffening == 0)
-    small = jnp.all(at_limit == iterate.at_limit, axis=0) & (largest < _small_step(params)) & convex
+    small = jnp.all(at_limit == iterate.at_limit, axis=0) & (largest < SMALL_STEP) & convex
     return Iterate(
         q=jnp.where(finite, iterate.q + scale * dq, iterate.q),
         pressure=jnp.where(finite, iterate.pressure + scale * dp, iterate.pressure),
@@ -356,11 +327,6 @@ def _newton_step(
         convex=convex,
         iteration=iterate.iteration + 1,
     )
-
-
-def _small_step(params: ArmParams) -> float:
-    """Return the largest entry of a small step; a wall's stiffness changes within less than a millimetre."""
-    return SMALL_STEP if params.contact is None else 0.1 * SMALL_STEP
 
 
 def _law_errors(spring_error_m: Array, pressure_kpa: Array, allocation: Allocation | None) -> Array:

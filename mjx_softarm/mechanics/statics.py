@@ -22,7 +22,6 @@ from jax import Array
 
 from mjx_softarm._support.small_matrices import block_diagonal, products
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
-from mjx_softarm.mechanics.contact import wall_terms
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.mechanics.params import ArmParams
 
@@ -244,14 +243,7 @@ def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
     w = [GRAVITY_M_S2 * by_section(mass[:, None] * slide[i], turn[i]) for i in range(3)]
     axis = [by_section(jnp.zeros_like(slide[i]), hinges[i]) for i in range(2)]  # a slide turns nothing
 
-    # Second derivatives in two factors; within a section they are written out
+    # Second derivatives in two factors
     above, below = jnp.stack([axis[0], -axis[1]], axis=2), jnp.stack([w[1], w[0]], axis=2)
     gradient = w[2].reshape(-1, *arms)
-    if params.contact is not None:
-        push, *factors = wall_terms(params.contact, frames)
-        gradient = gradient + push
-        above, below = (
-            jnp.concatenate([own, more.reshape(*own.shape[:2], -1, *arms)], axis=2)
-            for own, more in zip((above, below), factors, strict=True)
-        )
     return gradient, ChainHessian.of_factors(above, below)

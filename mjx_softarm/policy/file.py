@@ -252,7 +252,8 @@ def _take_reward(entries: Entries) -> RewardConfig:
 
 def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadEstimator, SpringModel]:
     """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries."""
-    n_sections, counts = spec.structure.n_sections, (spec.n_chambers, spec.n_springs)
+    n_sections = spec.structure.n_sections
+    counts = (spec.n_chambers, spec.n_springs)
     return (
         take_estimator(entries, "estimator", n_sections, spec.n_springs),
         take_load_estimator(entries, "load_estimator", n_sections, *counts),

@@ -93,6 +93,7 @@ def middle_kpa(gains: Gains, n_chambers: int) -> np.ndarray:
 
 def still(spring_m: Array, still_m: float = STILL_M) -> Array:
     """Return whether springs came to rest over a window (ticks, n) [m]: its halves have the same mean."""
-    xp, half = array_namespace(spring_m), len(spring_m) // 2
+    xp = array_namespace(spring_m)
+    half = len(spring_m) // 2
     moved_m = xp.mean(spring_m[-half:], axis=0) - xp.mean(spring_m[:half], axis=0)  # (n,)
     return xp.all(xp.abs(moved_m) < still_m)

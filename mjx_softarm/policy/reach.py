@@ -24,10 +24,14 @@ from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, share_of_turn
 from mjx_softarm.sensing.s2r import corrected
 
-N_STARTS, N_STEPS = 4, 20
+N_STARTS = 4
+N_STEPS = 20
 _DIFFERENCE = 1e-3  # step of the finite differences, as a share of the range of pressures
-_EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after a step that did not
-_LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e-3, 1e3
+_EASE = 0.2
+_STIFFEN = 8.0  # factors of the damping after a step that helped, and after a step that did not
+_LEAST_DAMPING = 1e-6
+_FIRST_DAMPING = 1e-3
+_MOST_DAMPING = 1e3
 _CHUNK = 256  # number of poses whose distances to all others are computed at once
 _INSIDE = 0.99  # distance over the limit of a goal that was brought back into the workspace
 _STAYING = 1e-4  # weight of a chamber that does not follow; chambers that follow have 1
@@ -119,7 +123,8 @@ def begin(policy: Policy, k: int) -> np.ndarray:
 def improve(policy: Policy, goal: Array, search: Array) -> Array:
     """Take one Levenberg-Marquardt step of a search (k * N_STARTS, n + 1) towards goals (k, 6) [mm, deg]."""
     # Error of each row and its slope by finite differences.
-    xp, n = array_namespace(goal, search), policy.spec.n_chambers
+    xp = array_namespace(goal, search)
+    n = policy.spec.n_chambers
     share, damping = search[:, :n], search[:, n]
     target = _target(policy, goal, len(share))  # (rows, f)
     error = _features_at(policy, share) - target
@@ -139,7 +144,8 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
 
 def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array]:
     """Return a search's nearest poses (k, 6) [mm, deg] to goals (k, 6), and their weighted errors (k,)."""
-    xp, share = array_namespace(goal, search), search[:, : policy.spec.n_chambers]
+    xp = array_namespace(goal, search)
+    share = search[:, : policy.spec.n_chambers]
     error = _features_at(policy, share) - _target(policy, goal, len(share))
     square = xp.sum(error**2, axis=-1).reshape(-1, N_STARTS)
     pose = pose_from_frame(*_tip(policy, share)).reshape(-1, N_STARTS, 6)
@@ -179,7 +185,8 @@ def _target(policy: Policy, goal: Array, n_rows: int) -> Array:
 def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
     """Return numbers (..., f) of poses; the norm of a difference is the weighted error, for small turns."""
     xp = array_namespace(position_m, axes)
-    position, weight = weighted_position(position_m, policy.reward), policy.reward.turn_weight_per_deg
+    position = weighted_position(position_m, policy.reward)
+    weight = policy.reward.turn_weight_per_deg
     axes = axes / xp.sqrt(xp.sum(axes**2, axis=-2))[..., None, :]
     if weight is None:
         return xp.concat([position, weighted_angles(axes, policy.reward)], axis=-1)
@@ -202,16 +209,19 @@ def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array
         policy: the arm.
     """
     # Motion and error of each chamber
-    xp, allocation = array_namespace(reference_m, mean_m), policy.gains.allocation
+    xp = array_namespace(reference_m, mean_m)
+    allocation = policy.gains.allocation
     move_m = at_chambers(reference_m - mean_m, allocation)
     stays = saturated & (move_m * at_chambers(asked_m - mean_m, allocation) > 0.0)
     if allocation is None:
         return xp.where(stays, mean_m, reference_m)
 
     # Planes by weighted least squares, at the springs
-    n_sections, n = policy.spec.structure.n_sections, policy.spec.structure.chambers_per_section
+    n_sections = policy.spec.structure.n_sections
+    n = policy.spec.structure.chambers_per_section
     weight = xp.where(stays, _STAYING, 1.0).reshape(n_sections, 1, n)
-    across, along_m = planes(n).T, xp.where(stays, 0.0, move_m).reshape(n_sections, 1, n)
+    across = planes(n).T
+    along_m = xp.where(stays, 0.0, move_m).reshape(n_sections, 1, n)
     normal = xp.sum((weight * across)[:, :, None] * across, axis=-1)  # (n_sections, 3, 3)
     plane = solve(normal, xp.sum(weight * across * along_m, axis=-1))  # (n_sections, 3)
     return mean_m + xp.sum(plane[:, None] * planes(policy.spec.springs_per_section), axis=-1).reshape(-1)

@@ -131,7 +131,8 @@ class Twin(InstrumentedArm):
     def _start_losses(self, spec: ArmSpec) -> None:
         """Start hysteresis and friction; they scale with the sections' lengths and stiffnesses."""
         # Lengths, forces and torques of the nominal arm's sections over those of the paper's (n_sections,)
-        paper, n_sections = ArmSpec.default(), spec.structure.n_sections
+        paper = ArmSpec.default()
+        n_sections = spec.structure.n_sections
         length = np.array(spec.per_section(spec.geometry.section_length_m)) / np.mean(
             paper.geometry.section_length_m
         )
@@ -141,7 +142,8 @@ class Twin(InstrumentedArm):
         torque = bending / np.mean(paper.backbone.bending_stiffness_nm_per_rad)
 
         # Joints (nq, 1), link by link
-        links, ones = self._parts.spec.structure.links_per_section, np.ones(n_sections)
+        links = self._parts.spec.structure.links_per_section
+        ones = np.ones(n_sections)
         limit = FRICTION_LIMIT * np.stack([force, torque, torque], axis=-1)
         stroke = FRICTION_STROKE * np.stack([length, ones, ones], axis=-1)
         limit, stroke = (np.repeat(x, links, axis=0).reshape(-1, 1) for x in (limit, stroke))
@@ -184,7 +186,8 @@ class Twin(InstrumentedArm):
     def motion_capture(self) -> Capture:
         """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
         spec, data = self._parts.spec, self._data
-        links, n_sections = spec.structure.links_per_section, spec.structure.n_sections
+        links = spec.structure.links_per_section
+        n_sections = spec.structure.n_sections
         thirds = np.arange(1, MARKERS_PER_SECTION * n_sections + 1) * links / MARKERS_PER_SECTION
         bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
         down = 0.5 * spec.link_length_m[bodies - 1, None] * data.xmat[bodies, 2::3]
@@ -238,7 +241,8 @@ class Twin(InstrumentedArm):
 
     def _step(self) -> None:
         """Take one time step; afterwards the data hold the lengths and positions at its end."""
-        data, n = self._data, len(self._parts.hysteresis)
+        data = self._data
+        n = len(self._parts.hysteresis)
         length_m = chamber_lengths(data, n)
         data.ctrl[:n] = self._air.step(length_m)
         data.ctrl[n:] = -self._hysteresis.move(length_m)

@@ -84,7 +84,8 @@ class InstrumentedArm(abc.ABC):
             2, size=np.size(sensor.delta_m)
         )
         shift_m = build.zero_m * (2 * up - 1)
-        self._sensor, self._scale = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m), build.noise
+        self._sensor = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m)
+        self._scale = build.noise
         self._lost = build.lost
         self._rng = np.random.default_rng([session, seed])
         self.time_s = 0.0

@@ -76,8 +76,11 @@ class Parts(NamedTuple):
 
 def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     """Draw the parts of a twin from its seed; they do not depend on the scales of noise and losses."""
-    rng, std = np.random.default_rng(seed), scaled_tolerances(Tolerances(), build.gap, spec)
-    n, n_springs, n_sections = spec.n_chambers, spec.n_springs, spec.structure.n_sections
+    rng = np.random.default_rng(seed)
+    std = scaled_tolerances(Tolerances(), build.gap, spec)
+    n = spec.n_chambers
+    n_springs = spec.n_springs
+    n_sections = spec.structure.n_sections
     off = partial(drawn, rng)
 
     # Chambers, springs and masses.
@@ -105,7 +108,8 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     beta = sensor.beta * (1.0 + off(std.spring_beta, n_springs))
     hole_m = _draw_holes(off, spec, std)
     # The base is not turned about z, because the twist of the first section does it.
-    mounting, tilt_rad = spec.mounting, np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]
+    mounting = spec.mounting
+    tilt_rad = np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]
     return Parts(
         spec=perturbed,
         sensor=dataclasses.replace(sensor, beta=beta, delta_m=delta_m),
@@ -121,7 +125,8 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
 
 def _draw_holes(off: Callable[..., np.ndarray], spec: ArmSpec, std: Tolerances) -> dict[str, np.ndarray]:
     """Draw the places (n, 2) of the rings' holes for chambers and for springs."""
-    geometry, n_sections = spec.geometry, spec.structure.n_sections
+    geometry = spec.geometry
+    n_sections = spec.structure.n_sections
     ring_m = off(std.ring_offset_m, n_sections, 2)
     first = np.radians(np.array(spec.per_section(geometry.first_chamber_deg)) + spec.section_roll_deg)
     hole_m = {}
@@ -129,7 +134,8 @@ def _draw_holes(off: Callable[..., np.ndarray], spec: ArmSpec, std: Tolerances) 
         ("chamber", spec.structure.chambers_per_section, geometry.chamber_radius_m),
         ("spring", spec.springs_per_section, geometry.spring_radius_m),
     ):
-        each, n = partial(np.repeat, repeats=per_section, axis=0), n_sections * per_section
+        each = partial(np.repeat, repeats=per_section, axis=0)
+        n = n_sections * per_section
         angle = each(first) + 2 * np.pi * np.arange(n) / per_section
         turned = angle + np.radians(off(std.hole_angle_deg, n))
         on_circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
@@ -145,7 +151,8 @@ def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
     tendon, whose control is a force [N]. Pressures are not clipped, because the regulators do it.
     """
     # Time step, and gravity in the tilted base.
-    spec, per_section = parts.spec, parts.spec.structure.links_per_section
+    spec = parts.spec
+    per_section = parts.spec.structure.links_per_section
     mjspec = build_spec(spec)
     period_s = 1.0 / spec.control.rate_hz
     mjspec.option.timestep = period_s / math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)

@@ -72,7 +72,8 @@ def add_pipe(
     for name, corner_m, colour, group in (*_walls(pipe), *_containers(pipe)):
         mesh = mjspec.add_mesh(name=name, uservert=((corner_m - base_m) @ base_rotation).ravel())
         solid = mjspec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
-        solid.rgba, solid.group = colour, group
+        solid.rgba = colour
+        solid.group = group
         _make_solid(solid, contype=1, conaffinity=0)
     _add_skin(mjspec, spec)
 
@@ -107,7 +108,8 @@ def _containers(pipe: CrossPipe):
     # Half the width of a side's floor. In a narrow pipe the wall itself is the floor.
     width = np.sqrt(max(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2, 0.0))
     for side in ("left", "right") if width > LEAST_WIDTH_M else ():
-        outwards, floor_z = np.sign(places[side][0]), places[side][2] - FLOOR_BELOW_M
+        outwards = np.sign(places[side][0])
+        floor_z = places[side][2] - FLOOR_BELOW_M
         for part, x, z in (
             ("floor", (pipe.radius_m + LEDGE_M, pipe.branch_m), (floor_z - SHEET_M, floor_z)),
             ("end", (pipe.branch_m, pipe.branch_m + SHEET_M), (floor_z - SHEET_M, floor_z + END_HEIGHT_M)),
@@ -128,7 +130,9 @@ def _add_skin(mjspec: mujoco.MjSpec, spec: ArmSpec) -> None:
         centres, size = (ring + rim, RIM_ROUNDING_M) if below < radius else (ring[None], radius)
         for k, centre in enumerate(centres):
             ball = mjspec.body(f"link{link}").add_geom(name=f"skin{link}_{k}", size=[size, 0.0, 0.0])
-            ball.pos, ball.mass, ball.group = centre, 0.0, _UNSEEN
+            ball.pos = centre
+            ball.mass = 0.0
+            ball.group = _UNSEEN
             _make_solid(ball, contype=0, conaffinity=1)
     for name in gripper_boxes(spec):
         _make_solid(mjspec.geom(f"gripper_{name}"), contype=0, conaffinity=1)

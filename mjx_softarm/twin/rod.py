@@ -183,7 +183,8 @@ class Rod:
     def _local(self, q: np.ndarray, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives of the energy of backbone, chambers and springs: (n, 6) and (n, 6, 6)."""
         # Stretch of the fibres, their pulls and the pulls' slopes, each (n, c + k)
-        h, u = self.length_m, self._stretch(q)
+        h = self.length_m
+        u = self._stretch(q)
         size = np.sqrt(np.sum(u**2, axis=-1))
         tension, slope = self._fibres(self._section_m * size, pressure_kpa)
 
@@ -200,7 +201,8 @@ class Rod:
 
     def _fibres(self, length_m: np.ndarray, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pulls (n, c + k) [N] of fibres with these lengths (n, c + k), and their slopes [N/m]."""
-        n_chambers, full_m = self.parts.stiffness.shape[1], self._section_m
+        n_chambers = self.parts.stiffness.shape[1]
+        full_m = self._section_m
         chamber, spring = length_m[:, :n_chambers], length_m[:, n_chambers:]
         stiffness, skew, hardening, rest, area, area_slope = self._chamber_law
         spring_stiffness, spring_rest = self._spring_law
@@ -240,7 +242,8 @@ class Rod:
         The rotation is that of the cross-sections below the element.
         """
         # Places of the masses, and the moment of all masses below each element.
-        h, parts = self.length_m, self.parts
+        h = self.length_m
+        parts = self.parts
         bend = self.q[:, :3]
         half, turn = rotation_about(0.5 * h * bend), rotation_about(h * bend)
         (node, rotation), begin, middle = self._shape(half, turn)

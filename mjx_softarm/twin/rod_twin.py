@@ -113,7 +113,8 @@ class RodTwin(InstrumentedArm):
         self._rod = self.rod_kind(parts, self._per_section)
 
         # Chambers with air and regulators
-        self._period_s, self.time_s = 1.0 / self._spec.control.rate_hz, 0.0
+        self._period_s = 1.0 / self._spec.control.rate_hz
+        self.time_s = 0.0
         area_m2, slope_m = 1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()
         rest_m = self._spec.at_chambers(self._spec.geometry.section_length_m)
         now_m = self._rod.chamber_lengths()
@@ -179,7 +180,8 @@ def draw_rod(
     """
     # Numbers of sections (s,), and of chambers (s, c)
     geometry, chambers, backbone = spec.geometry, spec.chambers, spec.backbone
-    s, n_chambers = spec.structure.n_sections, spec.structure.chambers_per_section
+    s = spec.structure.n_sections
+    n_chambers = spec.structure.chambers_per_section
     per_chamber = s, n_chambers
 
     def of_section(value: PerSection) -> np.ndarray:
@@ -236,7 +238,8 @@ def _holes(
     rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, radius_m: PerSection, n: int
 ) -> np.ndarray:
     """Draw places (s, n, 2) of n holes in each section at equal angles."""
-    s, first_deg = spec.structure.n_sections, np.array(spec.per_section(spec.geometry.first_chamber_deg))
+    s = spec.structure.n_sections
+    first_deg = np.array(spec.per_section(spec.geometry.first_chamber_deg))
     first = np.radians(first_deg + spec.section_roll_deg)[:, None]
     angle = first + 2 * np.pi * np.arange(n) / n
     angle = angle + np.radians(drawn(rng, std.hole_angle_deg, s, n))

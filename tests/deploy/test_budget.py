@@ -103,31 +103,22 @@ def test_shifts_of_the_springs_zeros_are_found_as_far_as_eight_goals_tell():
 
 
 @pytest.mark.parametrize(
-    ("parts_mm", "shift_mm", "strange"),
+    ("parts_mm", "shift_mm", "n_goals", "remedy"),
     [
-        ({"policy": -2.7, "law": 4.97}, 0.0, True),
-        ({"policy": 0.0, "law": 0.1, "springs": 55.0}, 11.0, True),
-        ({"policy": 0.0, "law": 0.1, "springs": 7.3}, 1.3, False),
+        # Parts that cancel, or zeros that no sensor loses, are of another arm; an aged one is not
+        ({"policy": -2.7, "law": 4.97}, 0.0, 8, "likely another arm"),
+        ({"policy": 0.0, "law": 0.1, "springs": 55.0}, 11.0, 8, "likely another arm"),
+        ({"policy": 0.0, "law": 0.1, "springs": 7.3}, 1.3, 8, "--since"),
+        ({"law": 0.1, "rest": 2.0}, 0.0, MIN_POSES, "record poses anew"),
+        # `calib run --since` refuses fewer
+        ({"law": 0.1, "springs": 2.0}, 0.0, MIN_POSES - 1, f"measure {MIN_POSES} or more"),
+        ({"law": 0.1, "rest": 2.0}, 0.0, 3, f"measure {MIN_POSES} or more"),
     ],
 )
-def test_an_arm_that_is_hardly_that_of_the_calibration(parts_mm, shift_mm, strange):
-    """Parts that cancel, or zeros that no sensor loses, are of another arm; an aged one is not."""
-    found = Budget(parts_mm, np.full(N, shift_mm), 0.0, 0.0, 0.2, 8, 3, calibrated=True)
-    assert found.strange == strange == ("likely another arm" in found.lines()[1])
-    assert not found._replace(calibrated=False).strange
-
-
-@pytest.mark.parametrize("largest", ["springs", "rest"])
-@pytest.mark.parametrize("n", [3, MIN_POSES - 1, MIN_POSES])
-def test_few_goals_lead_to_more_goals(largest, n):
-    """Under eight, `calib run --since` refuses the log; it fits zeros, so it never helps with the rest."""
-    found = Budget({"law": 0.1, largest: 2.0}, np.zeros(N), 0.0, 0.0, 0.2, n, 0, calibrated=True)
-    sentence = found.lines()[1]
-    few = n < MIN_POSES
-    assert (f"{n} goals do not tell a change from chance: measure {MIN_POSES} or more" in sentence) == few
-    assert ("--since" in sentence) == (not few and largest == "springs")
-    assert ("record poses anew" in sentence) == (not few and largest == "rest")
-    assert "calibrate it and train" in found._replace(calibrated=False).lines()[1] or largest == "springs"
+def test_remedies(parts_mm, shift_mm, n_goals, remedy):
+    parts = Budget(parts_mm, np.full(N, shift_mm), 0.0, 0.0, 0.2, n_goals, 3, calibrated=True)
+    assert remedy in parts.lines()[1] and parts.strange == ("another arm" in remedy)
+    assert not parts._replace(calibrated=False).strange
 
 
 def test_errors_as_at_the_calibration_are_the_models():

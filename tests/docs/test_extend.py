@@ -95,3 +95,12 @@ def test_a_benchmark(changed):
     assert "act us" in output(folder, *block("A benchmark", "sh").replace("2000", "10").split()[1:])
     figures = json.loads((folder / "docs/results/act.json").read_text())["figures"]
     assert 0.0 < figures["act_us"] < 1e4
+
+
+def test_tqc_swings_pendulums_up():
+    page = {"__name__": "page"}
+    exec(block("TQC on an environment of yours", "python"), page)
+    key = page["jax"].random.key(1)
+    policy, reward = page["train"](1500, page["jax"].random.key(0))
+    before = reward[: page["EPISODE"]].sum(axis=0).mean()  # random actions for half of the episode
+    assert before < -700.0 and page["returns"](policy, key).mean() > -300.0  # random: -1,200

@@ -11,7 +11,6 @@ from mjx_softarm._support.lazy import put
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.mjcf import build_model
-from mjx_softarm.mechanics.pipe import Contact, CrossPipe
 from mjx_softarm.spec import ArmSpec
 
 
@@ -70,24 +69,6 @@ def test_the_simulated_arm_may_have_fewer_links_than_the_specified_one():
         EnvConfig(links_per_section=0)
 
 
-@pytest.mark.parametrize(
-    "settings, message",
-    [
-        ({"clearance_cost_per_mm": 1.0}, "clearance_cost_per_mm: got 1.0, expected 0.0 without a pipe"),
-        ({"pipe_contact": True}, "pipe_contact: got True, expected False without a pipe"),
-        (
-            {"pipe_diameter_mm": 300.0, "pipe_contact": True, "mode": "dynamic", "engine": "mjx-step"},
-            "pipe_contact: got True, expected False with the engine 'mjx-step'",
-        ),
-    ],
-)
-def test_walls_that_cannot_be_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        EnvConfig(**settings)
-
-
-def test_a_wall_acts_on_the_arm_where_it_is_asked_to(spec):
-    pipe = {"n_poses": 1, "pipe_diameter_mm": 250.0}
-    assert ReachEnv(spec, EnvConfig(**pipe)).params.contact is None
-    acting = ReachEnv(spec, EnvConfig(**pipe, pipe_contact=True, engine="chain")).params.contact
-    assert acting == Contact.of(CrossPipe.of_mm(250.0), spec)
+def test_a_clearance_without_a_wall_is_refused():
+    with pytest.raises(ValueError, match="clearance_cost_per_mm: got 1.0, expected 0.0 without a pipe"):
+        EnvConfig(clearance_cost_per_mm=1.0)

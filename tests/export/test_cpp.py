@@ -158,7 +158,7 @@ def test_example_that_is_ended_vents_until_the_arm_has_taken_it(driven, number):
 
 @pytest.mark.parametrize("option", ["-Ofast", "-ffinite-math-only"])
 def test_header_refuses_mathematics_without_nan(folder, option):
-    with pytest.raises(AssertionError, match="tells lost readings by NaN"):
+    with pytest.raises(AssertionError, match="marks lost readings by NaN"):
         compile_("-fsyntax-only", option, folder / "rows.cpp")
 
 

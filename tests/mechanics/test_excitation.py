@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 @pytest.mark.parametrize("arm", [FOUR_CHAMBERS, SIX_CHAMBERS], ids=["four", "six"])
 def test_redundant_chambers_push_together_as_three_do(arm):
-    """Mean and bend of a section's pressures reach as far; all chambers are told apart."""
+    """Mean and bend of a section's pressures reach as far; all chambers are distinguished."""
     pressure_kpa = random_pressures(arm, 4000, 0)
     assert pressure_kpa.min() >= -40.0 and pressure_kpa.max() <= 20.0
 

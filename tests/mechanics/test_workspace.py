@@ -206,7 +206,7 @@ def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatc
     crimson = np.abs(image[..., :3] - [0.863, 0.078, 0.235]).max(-1) < 0.05
     assert image.shape[1] > image.shape[0] > 600 and crimson.sum() > 500  # the boundary is there
 
-    # Limits that are far from what the springs reach are told.
+    # Limits far from what the springs reach are reported
     far = SMALL.replace(springs={"length_max_m": 0.35})
     _tell_lengths(far, np.array([[0.1, 0.2, 0.26]]))
     asked = "length_max_m: 85 to 350 mm, expected about what they reach"

@@ -84,7 +84,7 @@ def test_picking_and_placing_hangs_a_mass_to_the_gripper_and_takes_it_off(inbox)
     goals = ask(pilot, inbox, place=True)[:6]
     state, row, held = start(CONTROLLER), {"time_s": 0.0}, []
     for goal in goals:
-        pilot.look(state._replace(goal=goal), row)
+        pilot.look(with_goal(CONTROLLER, state, goal)[0], row)
         pilot.look(state._replace(arrived=True), row)
         held.append(inbox.shown[-1]["look"].payload_kg)
     assert loads == [held[1], 0.0] and held == [0.0, held[1], held[1], held[1], 0.0, 0.0] and held[1] > 0.1

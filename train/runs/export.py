@@ -94,7 +94,8 @@ def export(
     if not weights:
         n_enough = sum(_export(path, out, onnx, cpp, calibration, console) for path in folders)
         return 0 if n_enough == len(folders) else 1
-    entries = actor_entries(Run.open(folders[0]))
+    (folder,) = folders
+    entries = actor_entries(Run.open(folder))
     write_sealed(weights, entries, WEIGHTS)
     layers = [entries[f"actor.{k}.weight"] for k in range(int(entries["actor.n_layers"]))]
     console.print(f"weights: {weights}, {_size(weights)}: actor {_widths(layers)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -19,12 +20,15 @@ from tensorboardX import SummaryWriter
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from train.agent.learner import LearnerConfig
+from train.agent.registry import name_of
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
 from train.epoch.state import TrainState
 from train.runs.checkpoint import RunError
 from train.runs.folder import EVALUATION_FILE, Run
 from train.runs.task import Task, task_of
+
+SLOW_S = 3.0  # longer work than this is announced
 
 
 class Interrupted(Exception):
@@ -48,7 +52,11 @@ def train(run: Run, task: Task, console: Console) -> Any:
     """
 
     def begin() -> tuple[int, TrainState]:
-        console.print("compiling (cached for the next start) ...")
+        learner = run.config.learner
+        console.print(
+            f"compiling an epoch of {learner.n_arms} arms with updates of {name_of(learner)} "
+            "(cached for the next start) ..."
+        )
         epoch, state = task.job.start(first)
         run.rewind(epoch)
         return epoch, state
@@ -108,7 +116,8 @@ def train_together(
                 refuse_divergence(run.config, row["env/unsettled"])
                 own = job.member(state, k) if due or stop else None
                 if own is not None and due:
-                    row |= evaluation(run, task, learner.policy(own.learner))
+                    with noted(console, "compiling the evaluation ..."):
+                        row |= evaluation(run, task, learner.policy(own.learner))
                 record(run, board, epoch, row)
                 if own is not None:
                     run.checkpoints.save(epoch, own, learner.parts(own.learner))
@@ -117,6 +126,17 @@ def train_together(
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {path}")
     states = (job.member(state, k) for k in range(len(members)))
     return [finish(*member, learner.policy(own.learner)) for member, own in zip(members, states, strict=True)]
+
+
+@contextmanager
+def noted(console: Console, text: str) -> Iterator[None]:
+    """Print a text if the work inside takes longer than `SLOW_S`, as the first call of a program may."""
+    timer = threading.Timer(SLOW_S, console.print, [text])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:

@@ -46,7 +46,8 @@ LOST_S = 1.0  # time without a frame after which motion capture counts as lost; 
 MOST_POLLS = 50  # polls that pass over queued frames; they read more than a socket holds; by hand
 # Largest distance of the tip from the end of the straight arm, in its lengths, and largest angle; by hand.
 # Wrong axes are 1.4 lengths and 90 degrees off.
-_NEAR, _TURNED_DEG = 0.5, 60.0
+_NEAR = 0.5
+_TURNED_DEG = 60.0
 _KINDS = {"natnet": NatNet, "qualisys": Qualisys}
 
 
@@ -54,7 +55,9 @@ class Delay:
     """Delay of frames beyond that of the fastest, on two clocks that need not agree."""
 
     def __init__(self) -> None:
-        self._offset_s, self._frame_s, self._now_s = np.inf, -np.inf, 0.0
+        self._offset_s = np.inf
+        self._frame_s = -np.inf
+        self._now_s = 0.0
 
     def measure(self, frame_s: float, now_s: float) -> float:
         """Return the delay [s] of a frame with a time [s] on its own clock, taken at a time [s] on ours."""
@@ -62,7 +65,9 @@ class Delay:
         if frame_s < self._frame_s or now_s - self._now_s > LOST_S:
             self._offset_s = np.inf
         drifted_s = self._offset_s + DRIFT * (now_s - self._now_s)
-        self._offset_s, self._frame_s, self._now_s = min(drifted_s, now_s - frame_s), frame_s, now_s
+        self._offset_s = min(drifted_s, now_s - frame_s)
+        self._frame_s = frame_s
+        self._now_s = now_s
         return now_s - frame_s - self._offset_s
 
 
@@ -77,11 +82,18 @@ class CapturedArm:
     """
 
     def __init__(self, arm: Any, source: Source, name: CaptureName, tell: Callable[[str], None]):
-        self._arm, self._source, self._name, self._tell = arm, source, name, tell
-        self._delay, self._seen_s, self._lost = Delay(), time.monotonic(), False
+        self._arm = arm
+        self._source = source
+        self._name = name
+        self._tell = tell
+        self._delay = Delay()
+        self._seen_s = time.monotonic()
+        self._lost = False
         self._polled_s = -np.inf  # time of the last frame, whatever it shows
         self._base: tuple[np.ndarray, np.ndarray] | None = None if name.base else (np.zeros(3), np.eye(3))
-        self._n_asked, self._latency_s, self._delay_s = 0, [], []
+        self._n_asked = 0
+        self._latency_s = []
+        self._delay_s = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._arm, name)
@@ -103,7 +115,8 @@ class CapturedArm:
             raise
         if self._lost:
             self._tell(f"motion capture: back after {now_s - self._seen_s:.1f} s")
-        self._seen_s, self._lost = now_s, False
+        self._seen_s = now_s
+        self._lost = False
         return seen
 
     def finish(self) -> str:
@@ -118,10 +131,12 @@ class CapturedArm:
 
     def _newest(self) -> CaptureFrame | None:
         """Return the newest frame since the last call; None without one, or if it may be an old one."""
-        frame, now_s = self._source.poll(), time.monotonic()
+        frame = self._source.poll()
+        now_s = time.monotonic()
         if frame is None:
             return None
-        paused, self._polled_s = now_s - self._polled_s > LOST_S, now_s
+        paused = now_s - self._polled_s > LOST_S
+        self._polled_s = now_s
         if not paused:
             return frame
         # Frames have queued up, maybe until the queue was full: all may be old. The next one is new.
@@ -131,7 +146,8 @@ class CapturedArm:
         return None
 
     def _take(self) -> Capture:
-        name, frame = self._name, self._newest()
+        name = self._name
+        frame = self._newest()
         if frame is None:
             raise TimeoutError(f"got no new frame from {name.host}")
         delay_s = self._delay.measure(frame.time_s, time.monotonic())
@@ -170,7 +186,8 @@ def with_capture(arm: Any, name: str | None, spec: ArmSpec, tell: Callable[[str]
     """
     if name is None:
         return arm
-    read, where = CaptureName.read(name), f"--capture {name}"
+    read = CaptureName.read(name)
+    where = f"--capture {name}"
     if hasattr(arm, "motion_capture"):
         raise InputError(
             f"--capture: got {name} and an arm with its own motion capture, expected one of them"

@@ -22,7 +22,8 @@ from mjx_softarm._support.errors import needing
 from mjx_softarm.deploy.capture.system import CaptureFrame, CaptureName, check_names
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 
-COMMAND_PORT, DATA_PORT = 1510, 1511
+COMMAND_PORT = 1510
+DATA_PORT = 1511
 WAIT_S = 2.0  # longest wait for the server's answer, for its descriptions, and for the first frame
 AGAIN_S = 1.0  # time without a frame after which the server is asked again; it may have begun anew
 MOST = 20  # number of packets that one poll reads at most, so that a flood does not hold up the loop
@@ -59,7 +60,8 @@ class NatNet:
             raise TimeoutError(f"got {what} from {name.host}, expected Motive to stream")
 
         # Bodies and markers, as the server describes them
-        described, where = self._described, f"--capture natnet:{name.host}"
+        described = self._described
+        where = f"--capture natnet:{name.host}"
         sets = {one.name: len(one.marker_names) for one in described.marker_sets}
         for body in (name.body, name.base):
             check_names(where, "body", body, sorted(one.name for one in described.rigid_bodies))
@@ -69,11 +71,14 @@ class NatNet:
     def poll(self) -> CaptureFrame | None:
         """Return the newest frame since the last call, None without one, at once; see `Source`."""
         self._read()
-        frame, now_s = self._new[-1] if self._new else None, time.monotonic()
+        frame = self._new[-1] if self._new else None
+        now_s = time.monotonic()
         self._new.clear()
         # After a while without a frame the server may have begun anew, and its bodies have other numbers.
         if now_s - self._asked_s > AGAIN_S:
-            self._asked_s, self._described, self._first = now_s, None, None
+            self._asked_s = now_s
+            self._described = None
+            self._first = None
             self._client.send_request(self._client.NAT_CONNECT)
             self._client.request_modeldef()
         if frame is None or self._described is None:

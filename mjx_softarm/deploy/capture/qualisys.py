@@ -61,7 +61,8 @@ class Qualisys:
         if not self._connected():
             why = f"; the last try to connect again: {self._error}" if self._error else ""
             raise ConnectionResetError(f"got an end of the connection by {self._name.host}{why}")
-        packet, self._packet = self._packet, None
+        packet = self._packet
+        self._packet = None
         return self._frame(packet) if packet is not None else None
 
     def close(self) -> None:
@@ -120,7 +121,8 @@ class Qualisys:
         Raises:
             InputError: QTM has no such body or no such markers.
         """
-        name, where = self._name, f"--capture qualisys:{self._name.host}"
+        name = self._name
+        where = f"--capture qualisys:{self._name.host}"
         settings = await connection.get_parameters(["6d", "3d"])
 
         # Places of bodies and markers in frames, by the order of QTM's settings

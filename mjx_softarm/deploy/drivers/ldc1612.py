@@ -66,7 +66,8 @@ class LdcSprings:
             )
         if not 0 <= drive_current <= 31:
             raise ValueError(f"drive_current: got {drive_current}, expected 0 to 31")
-        self._n, self._timeout_s = len(channels), timeout_s
+        self._n = len(channels)
+        self._timeout_s = timeout_s
 
         # Buses, and converters set going
         with needing("i2c", "ldc1612"):
@@ -91,7 +92,8 @@ class LdcSprings:
             except OSError:  # this converter's springs are not read; all of them end the run
                 continue
             for (channel, spring), high, low in zip(springs.items(), words[::2], words[1::2], strict=True):
-                unread, errors = status >> (3 - channel) & 1, high >> 12
+                unread = status >> (3 - channel) & 1
+                errors = high >> 12
                 if unread and not errors:
                     readings[spring] = ((high << 16) | low) * CLOCK_HZ / 2**28
         return readings

@@ -120,7 +120,8 @@ class Paced:
     """A simulated arm that is no faster than a real one."""
 
     def __init__(self, arm: Any):
-        self._arm, self._began_s = arm, time.monotonic() - arm.time_s
+        self._arm = arm
+        self._began_s = time.monotonic() - arm.time_s
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._arm, name)
@@ -161,7 +162,8 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
         InputError: it is another; the message begins with `name`.
     """
     # Readings; a run, too, waits LOST_TICKS ticks for them
-    policy, spec = controller.policy, controller.policy.spec
+    policy = controller.policy
+    spec = controller.policy.spec
     length_m = np.full(spec.n_springs, np.nan)
     for _ in range(LOST_TICKS):
         readings = check_number(arm, spec, name)

@@ -101,7 +101,8 @@ class Renderer:
         _draw_mount(scene, self._base_m, self._base_rotation)
         if payload_radius_m > 0.0:
             held = self._data.body("payload").xpos
-            ball, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, payload_radius_m)
+            ball = mujoco.mjtGeom.mjGEOM_SPHERE
+            size = np.full(3, payload_radius_m)
             _append(scene, ball, size, held, np.eye(3), _PAYLOAD_COLOUR)
         _add_light(scene, np.radians(view.azimuth))
         return self._renderer.render()

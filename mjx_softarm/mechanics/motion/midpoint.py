@@ -23,7 +23,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -88,70 +88,92 @@ def advance(
         State and observables at the end.
     """
     n_ticks, n_steps = round(duration_s / period_s), math.ceil(period_s / step_s - 1e-9)
+    tick = functools.partial(_tick, arm, n_steps, period_s)
+    forward, back = (
+        xla.rows_last(function, n_at_once, n_shared=1)
+        for function in (functools.partial(_run, tick, n_ticks), functools.partial(_run_back, tick))
+    )
+    run = jax.custom_vjp(lambda start, constants: forward(start, constants)[0])
 
-    def ticks(constants: tuple[control.Gains, ArmParams, MotionParams]) -> Callable[..., tuple[Motion, Path]]:
-        gains, params, own = constants
-        return functools.partial(_tick, arm._replace(params=params, own=own), gains, n_steps, period_s)
+    def forward_keeping(start: tuple[Motion, Array], constants: _Constants) -> tuple[Any, Any]:
+        found, kept = forward(start, constants)
+        return found, (kept, constants)
 
-    def run(start: tuple[Motion, Array], constants: Any) -> tuple[tuple[Motion, Path, Path], Motion]:
-        """Return state and observables at the end, and the path there; and the state before each period."""
-        motion, reference_m = start
-        tick = ticks(constants)
-
-        def go_on(motion: Motion, _: None) -> tuple[Motion, tuple[Path, Motion]]:
-            after, seen = tick(motion, reference_m)
-            return after, (seen, motion)
-
-        with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-            end, (path, before) = jax.lax.scan(go_on, motion, None, length=n_ticks)
-            return (end, _look(constants[1], end.q), path), before
-
-    def run_back(change: tuple[Motion, Path, Path], states: Any, constants: Any) -> tuple[Motion, Array]:
-        """Return the gradient by state and reference at the start; each period is computed again."""
-        d_end, d_last, d_path = change
-        before, end_q, reference_m = states
-        tick = ticks(constants)
-
-        def go_back(d_after: tuple[Motion, Array], at: tuple[Motion, Path]) -> tuple[Any, None]:
-            motion, d_seen = at
-            d_motion, d_reference = jax.vjp(tick, motion, reference_m)[1]((d_after[0], d_seen))
-            return (d_motion, d_after[1] + d_reference), None
-
-        with jax.default_matmul_precision("highest"):
-            (d_q,) = jax.vjp(functools.partial(_look, constants[1]), end_q)[1](d_last)
-            d_after = d_end._replace(q=d_end.q + d_q), jnp.zeros_like(reference_m)
-            return jax.lax.scan(go_back, d_after, (before, d_path), reverse=True)[0]
-
-    forward, back = (xla.rows_last(function, n_at_once, n_shared=1) for function in (run, run_back))
-    moved = jax.custom_vjp(lambda start, constants: forward(start, constants)[0])
-
-    def forward_and_states(start: tuple[Motion, Array], constants: Any) -> tuple[Any, Any]:
-        found, before = forward(start, constants)
-        return found, ((before, found[0].q, start[1]), constants)
-
-    moved.defvjp(forward_and_states, lambda given, change: (back(change, *given), None))
-    end, last, path = moved((motion, reference_m), (gains, arm.params, arm.own))
+    run.defvjp(forward_keeping, lambda given, change: (back(change, *given), None))
+    end, last, path = run((motion, reference_m), _Constants(gains, arm.params, arm.own))
     return end, MotionEnd.of(end, last, path)
 
 
+class _Constants(NamedTuple):
+    """Numbers without a gradient."""
+
+    gains: control.Gains
+    params: ArmParams
+    own: MotionParams
+
+
+_Kept = tuple[Motion, Array, Array]  # state before each control period, last joint coordinates, reference
+
+
+def _run(
+    tick: Callable, n_ticks: int, start: tuple[Motion, Array], constants: _Constants
+) -> tuple[tuple[Motion, Path, Path], _Kept]:
+    """Return state and observables at the end, the path there, and what the gradient needs; arms are last."""
+    motion, reference_m = start
+
+    def go_on(motion: Motion, _: None) -> tuple[Motion, tuple[Path, Motion]]:
+        after, seen = tick(constants, motion, reference_m)
+        return after, (seen, motion)
+
+    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+        end, (path, before) = jax.lax.scan(go_on, motion, None, length=n_ticks)
+        return (end, _look(constants.params, end.q), path), (before, end.q, reference_m)
+
+
+def _run_back(
+    tick: Callable, change: tuple[Motion, Path, Path], kept: _Kept, constants: _Constants
+) -> tuple[Motion, Array]:
+    """Return the gradient by state and reference at the start, from that by the results of `_run`.
+
+    Each control period is computed again, which takes less time than to store its numbers.
+    """
+    before, end_q, reference_m = kept
+    d_end, d_last, d_path = jax.lax.optimization_barrier(change)  # XLA would take minutes to fold zeros
+
+    def go_back(d_after: tuple[Motion, Array], at: tuple[Motion, Path]) -> tuple[tuple[Motion, Array], None]:
+        motion, d_seen = at
+        _, pull_back = jax.vjp(functools.partial(tick, constants), motion, reference_m)
+        d_motion, d_reference = pull_back((d_after[0], d_seen))
+        return (d_motion, d_after[1] + d_reference), None
+
+    with jax.default_matmul_precision("highest"):
+        (d_q,) = jax.vjp(functools.partial(_look, constants.params), end_q)[1](d_last)
+        d_end = d_end._replace(q=d_end.q + d_q), jnp.zeros_like(reference_m)
+        return jax.lax.scan(go_back, d_end, (before, d_path), reverse=True)[0]
+
+
 def _tick(
-    arm: MovingArm, gains: control.Gains, n_steps: int, period_s: float, motion: Motion, reference_m: Array
+    arm: MovingArm,
+    n_steps: int,
+    period_s: float,
+    constants: _Constants,
+    motion: Motion,
+    reference_m: Array,
 ) -> tuple[Motion, Path]:
-    """Run one control period: observe, let the law command pressures, take the time steps; arms are last."""
-    seen = _look(arm.params, motion.q)
+    """Run one control period: observe, let the law command pressures, take the time steps."""
+    gains, params, own = constants
+    seen, arms = _look(params, motion.q), reference_m.ndim - 1
 
     # The law takes arms first
-    told: tuple[Any, Any, Any, Any] = reference_m, seen.spring_m, motion.law, gains
-    if reference_m.ndim > 1:
-        told = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), told)
+    told: Any = reference_m, seen.spring_m, motion.law, gains
+    told = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), told) if arms else told
     command, law = control.pressures(*told, dt_s=period_s)
-    if reference_m.ndim > 1:
-        command, law = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (command, law))
+    command, law = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (command, law)) if arms else (command, law)
 
-    motion = motion._replace(law=law)
+    earlier = pushed(motion.earlier_kpa, motion.command_kpa)
+    motion, arm = motion._replace(law=law), arm._replace(params=params, own=own)
     for k in range(n_steps):
         motion = _step(arm, motion, command, k, period_s / n_steps, period_s)
-    earlier = pushed(motion.earlier_kpa, motion.command_kpa)
     return motion._replace(command_kpa=command, earlier_kpa=earlier), seen
 
 

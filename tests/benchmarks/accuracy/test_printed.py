@@ -1,14 +1,14 @@
 """The paper's recipe as printed: its cases, its demonstrations and its figures, on made-up courses."""
 
-import numpy as np
+import json
+
 import pytest
 
+from benchmarks.__main__ import main
 from benchmarks.accuracy import printed
-from benchmarks.accuracy.printed import CASES, PRESETS, curves, curves_figure, loss_rows, over_seeds, run_name
-from mjx_softarm import ArmSpec
+from benchmarks.accuracy.printed import CASES, PRESETS, curves, loss_rows, over_seeds, run_name
+from benchmarks.harness import common
 from train.config import override
-from train.demos.demonstrations import load_demonstrations
-from train.demos.posture import Posture
 from train.presets import IMITATION_PRESETS
 
 
@@ -46,37 +46,9 @@ def test_the_paper_s_recipe_is_as_printed():
     assert (pipe.total_env_steps, pipe.rebalance_env_steps) == (1_000_000, 100_000)
 
 
-def test_demonstrations_are_the_expert_s_postures(tmp_path, monkeypatch):
-    spec = ArmSpec.default()
-    pose = np.array([[k, 2.0 * k, -560.0, 10.0, -k, 3.0] for k in range(16)])
-    spring_m = np.linspace(0.17, 0.19, 16 * spec.n_springs).reshape(16, -1)
-    plan = Posture(None, spring_m, pose, None, None, None, None)
-    monkeypatch.setattr(printed, "Expert", lambda *_: type("Planner", (), {"plan": lambda *_: plan}))
-    printed.demonstrate(tmp_path, printed.PrintedSettings(), "circle16")
-    shown = load_demonstrations(tmp_path / "demos/circle16.npz", spec)
-    np.testing.assert_allclose(shown.positions, pose, atol=1e-3)
-    np.testing.assert_array_equal(shown.sequence, 0)
-    assert np.all(np.diff(shown.actions[:, 0]) != 0.0)
-
-
-def test_a_training_resumes_what_there_is(tmp_path, monkeypatch):
-    calls = []
-    monkeypatch.setattr(printed, "command", lambda log, *words: calls.append(words))
-    settings = printed.PrintedSettings(env_steps=600_000)
-    printed.train(tmp_path, settings, "pipe-hand-made", 1)
-    run = tmp_path / "pipe-hand-made-seed1"
-    run.mkdir()
-    (run / "config.json").touch()
-    printed.train(tmp_path, settings, "pipe-hand-made", 1)
-    new, resumed = calls
-    assert resumed == ("imitate", "--resume", str(run))
-    assert new[:4] == ("imitate", str(tmp_path / "demos/pipe300.npz"), "--preset", "paper-pipe")
-    assert {"--pipe", "300", "600000", "--learner.learned_weight=0"} <= set(new)
-
-
 def test_figures_are_over_the_seeds_of_a_case():
     runs = [course((0.0, 0.5)), course((0.25, 1.0), median_mm=3.0)]
-    row = over_seeds("circle-learned", runs, [{"circle_mm": 2.0}, {"circle_mm": 2.0}])
+    row = over_seeds("circle-learned", runs)
     assert row == {
         "case": "circle-learned",
         "seeds": 2,
@@ -84,7 +56,6 @@ def test_figures_are_over_the_seeds_of_a_case():
         "updates": 50,
         "success_share": "0.75 (0.5 to 1)",
         "median_mm": "4 (3 to 5)",
-        "circle_mm": "2",
     }
     assert curves({"circle-learned": runs}) == {
         "circle-learned": {"env_steps": [300, 600], "success_percent": [[0.0, 50.0], [25.0, 100.0]]}
@@ -102,12 +73,10 @@ def test_losses_begin_with_the_first_update():
     }
 
 
-def test_success_and_losses_are_drawn():
-    metrics = {name: [course((0.0, 0.5))] * 2 for name in CASES}
-    figure = curves_figure(metrics)
-    error, success, pipe, *losses = figure.axes
-    assert [len(panel.lines) for panel in (error, success, pipe, *losses)] == [5, 5, 2, 3, 3, 3]
-    assert error.get_yscale() == "log"
-    without = curves_figure({name: runs for name, runs in metrics.items() if "pipe" not in name})
-    assert not without.axes[2].axison
-    assert [line.get_label() for line in losses[0].lines] == ["on D, as printed", "on the logit", "none"]
+@pytest.mark.slow
+def test_smoke(tmp_path, monkeypatch):
+    options = ["--cases", "circle-learned", "--seeds", "0", "--env-steps", "8000", "--out", str(tmp_path)]
+    monkeypatch.setattr(common, "RESULTS", tmp_path / "results")
+    assert main(["printed", *options]) == 0
+    (case,) = json.loads((tmp_path / "results/printed.json").read_text("utf-8"))["figures"]["cases"]
+    assert case["case"] == "circle-learned" and case["env_steps"] >= 8000

@@ -33,19 +33,6 @@ def test_a_list_of_rows_is_a_table_with_a_column_for_every_name_in_any_row():
     assert ["1", "", "no [cuda] here"] in cells(text)
 
 
-def test_other_dictionaries_are_titled_by_their_path_and_what_is_loose_comes_first():
-    figures = {
-        "inner": {"deep_down": {"x": 1, "groups": [{"y": 2, "z": {"a": 1}}]}},
-        "unsettled": 0,
-        "rounds": [3, 4],
-    }
-    text = shown(figures, "settle")
-    assert cells(text) == [["unsettled", "0"], ["rounds", "[3, 4]"], ["x", "1"], ["y", "2"], ["a", "1"]]
-    deep = "settle, inner, deep down"
-    titles = ["settle", deep, f"{deep}, groups, 1", f"{deep}, groups, 1, z"]
-    assert [line for line in text.splitlines() if line.startswith("settle")] == titles
-
-
 @pytest.mark.parametrize(("met", "status"), [(True, 0), (None, 0), (False, 1)])
 def test_a_missed_target_ends_with_status_1_and_its_file_is_there(met, status, monkeypatch, tmp_path):
     monkeypatch.setattr(common, "RESULTS", tmp_path)

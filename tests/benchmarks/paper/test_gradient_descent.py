@@ -49,13 +49,6 @@ def test_gradient_is_that_of_automatic_differentiation(policy):
     assert np.linalg.norm(found - expected) < 2e-3 * np.linalg.norm(expected)
 
 
-def test_gradient_of_a_linear_residual_is_the_closed_form():
-    rng = np.random.default_rng(1)
-    matrix, target, here = 1e3 * rng.normal(size=(6, N)), *rng.uniform(0.1, 0.2, (2, N))
-    found = gradient(lambda x: (x - target) @ matrix.T, here)
-    assert np.allclose(found, matrix.T @ matrix @ (here - target), rtol=1e-6)
-
-
 def test_goals_of_the_own_forward_kinematics_are_reached(policy):
     plan, pose_of = gradient_descent(policy), forward_kinematics(policy)
     goals = pose_of(random_springs(2, seed=5))

@@ -5,7 +5,6 @@ import pytest
 
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
-from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from train.agent.hindsight import HindsightConfig
 
@@ -108,29 +107,3 @@ def test_goals_near_the_pose_reached_are_as_many_and_as_far_as_asked_for(played,
     free = ~played.saturated[tuple(where)]
     reached = np.linalg.norm(rewards.scaled_error(after, goal, played.arm.config.reward), axis=1) < 0.03
     np.testing.assert_array_equal(batch.rewards.numpy()[free, 0] == 10.0, reached[free])
-
-
-def test_a_goal_elsewhere_gives_the_reward_and_the_observations_of_the_way_to_it(played, monkeypatch):
-    buffer, arm, where = played.buffer, played.arm, played.where
-    goal = np.array([30.0, -20.0, -590.0, 10.0, 5.0, -5.0], np.float32)
-    goals = np.tile((goal - arm.scale.centre) / arm.scale.scale, (len(where[0]), 1))
-    monkeypatch.setattr(buffer, "_sample_goals", lambda *where: goals)
-    batch = buffer._get_virtual_samples(*where)
-    before, after = (
-        played.pose(poses["achieved_goal"][where])
-        for poses in (buffer.observations, buffer.next_observations)
-    )
-    for found, poses in ((batch.observations, before), (batch.next_observations, after)):
-        flat = np.concatenate(
-            [found[name] for name in ("achieved_goal", "desired_goal", "observation")], axis=1
-        )
-        wanted = obs.observe(poses, np.broadcast_to(goal, poses.shape), arm.scale, arm.config.reward)
-        np.testing.assert_allclose(flat, wanted, atol=1e-5)
-    n_steps = np.zeros(len(after), int)  # counted back to the episode's first transition
-    for k, (row, i) in enumerate(zip(*where, strict=True)):
-        n_steps[k] = 1 + (row - buffer.ep_start[row, i]) % N_ROWS
-    assert set(n_steps) == {1, 2, 3}
-    error = np.linalg.norm(rewards.scaled_error(after, goal, arm.config.reward), axis=1)
-    wanted = np.where(played.saturated[where], -10.0, REWARD_SCALE * (-10 * error - 0.1 * n_steps))
-    np.testing.assert_allclose(batch.rewards[:, 0], wanted, atol=1e-4)
-    assert not batch.dones.any()

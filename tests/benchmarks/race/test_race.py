@@ -1,20 +1,25 @@
-"""The race: contestants and their processes, what each is given, what is kept; with a made-up program."""
+"""The race: clock and limits of contestants, with a made-up program; levels, targets and kept results."""
 
-import json
 import sys
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
-from benchmarks.__main__ import main
 from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import Worker, WorkerError
 from benchmarks.race import race
 from benchmarks.race.contestants import CONTESTANTS, Contestant, HeldOut, prepare, settings_of
-from benchmarks.race.race import RaceError, RaceLimits, limits_of, run, train
-from benchmarks.race.threads import choose_threads
+from benchmarks.race.race import (
+    PeerTarget,
+    RaceError,
+    RaceLimits,
+    crossing,
+    judge,
+    limits_of,
+    run,
+    train,
+)
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.actions import N_ACTIONS
@@ -25,29 +30,16 @@ from train.presets import PRESETS
 from train.runs import evaluate
 
 FAKE = '''
-"""A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each; or it stops by itself."""
-import sys
-from benchmarks.__main__ import main
+"""A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each."""
 from benchmarks.harness.rounds import serve
-name, seed, stretch_s, n_goals = sys.argv[1:]
 k = 0
 def work():
     global k
     k += 1
-    if "broken" in name and k == 2:
-        raise RuntimeError("not today")
     return {"wall_s": 3 + 10.0 * k, "trained_s": 10.0 * k, "env_steps": 1000 * k, "updates": k,
             "median_mm": 100 / k, "ended": k == 30}
 serve(lambda: ({"start_up_s": 3.0}, work))
 '''
-
-
-@pytest.fixture
-def fake(tmp_path, monkeypatch):
-    """A function: name -> a worker that is not started."""
-    (tmp_path / "fake_contestant.py").write_text(FAKE, "utf-8")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return lambda name="fake": Worker(name, ["fake_contestant", name, "0", "1.0", "8"])
 
 
 @pytest.mark.parametrize(
@@ -58,11 +50,12 @@ def fake(tmp_path, monkeypatch):
         (RaceLimits(), 30),  # ended
     ],
 )
-def test_a_contestant_trains_until_its_limit_its_target_or_its_end(fake, limits, n_points):
-    found = train(fake(), limits)
-    assert [point["updates"] for point in found["points"]] == list(range(1, n_points + 1))
-    assert found["start_up_s"] == 3.0 and "ended" not in found["points"][-1]
-    json.dumps(found, allow_nan=False)
+def test_a_contestant_trains_until_its_limit_its_target_or_its_end(tmp_path, monkeypatch, limits, n_points):
+    (tmp_path / "fake_contestant.py").write_text(FAKE, "utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    result = train(Worker("fake", ["fake_contestant"]), limits)
+    assert [point["updates"] for point in result["points"]] == list(range(1, n_points + 1))
+    assert result["start_up_s"] == 3.0 and "ended" not in result["points"][-1]
 
 
 def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkeypatch):
@@ -70,7 +63,6 @@ def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkey
 
     class Slow:
         def __init__(self, env, n_goals):
-            assert n_goals == 8
             clock[0] += 1000
 
         def tip_error_mm(self, policy):
@@ -98,17 +90,16 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler, mon
     env = ReachEnv(SHORT, EnvConfig(n_poses=16))
     agent = TQC(env.observation_size, env.action_size)
     params = agent.init(jax.random.PRNGKey(3)).actor_params
-    held_out = HeldOut(env, 12)
-    found = held_out.tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
+    errors_mm = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
     paths = evaluate.paths_of(env.sample_pool(12, HELD_OUT_SEED).pose)
     follow = jax.vmap(evaluate.follower(env, agent, N_ACTIONS), in_axes=(None, 0, 0))
     reached = xla.jit(follow)(params, paths, evaluate.start_keys(2))
-    assert np.ptp(found) > 10.0
+    assert np.ptp(errors_mm) > 10.0
     expected = np.linalg.norm((reached.pose - reached.goal)[..., :3], axis=-1)
-    np.testing.assert_allclose(found, expected.reshape(-1), atol=0.01)
+    np.testing.assert_allclose(errors_mm, expected.reshape(-1), atol=0.01)
 
 
-def test_peers_have_the_quick_preset_s_settings():
+def test_peers_have_the_settings_of_quick():
     n_steps, config = [0], PRESETS["quick"].learner
     settings = settings_of(config, lambda: n_steps[0])
     rate = settings.pop("learning_rate")
@@ -116,112 +107,98 @@ def test_peers_have_the_quick_preset_s_settings():
     values = (config.replay_capacity, 2048, 128, 0.005, 0.1, 1, 16, "auto_0.1", -30.0)
     assert settings == dict(zip((*names, "ent_coef", "target_entropy"), values, strict=True))
     n = config.total_env_steps
-    rates = {0: 4e-3, n // 2: 2.04e-3, n - 1: 0.08e-3, n: 4e-3, n + n // 2: 2.04e-3}
-    for n_steps[0], expected in rates.items():
+    for n_steps[0], expected in {0: 4e-3, n // 2: 2.04e-3, n - 1: 0.08e-3, n: 4e-3}.items():
         assert rate(1.0) == pytest.approx(expected, rel=1e-3)
 
 
-POINTS = [  # 10 mm at 17 s, 5 mm at 29.5 s
-    {"wall_s": wall_s, "trained_s": wall_s - 2, "env_steps": 100, "updates": 1, "median_mm": error_mm}
-    for wall_s, error_mm in ((12.0, 12.0), (22.0, 8.0), (32.0, 4.0))
-]
+def result(name, *errors_mm, seed=0):
+    """A contestant with a point each 10 s; 2 s of start-up."""
+    names = ("wall_s", "trained_s", "env_steps", "updates", "median_mm")
+    values = [(2.0 + 10 * k, 10.0 * k, 100 * k, k, error) for k, error in enumerate(errors_mm, 1)]
+    points = [dict(zip(names, point, strict=True)) for point in values]
+    return {"contestant": name, "seed": seed, "start_up_s": 2.0, "limit_s": None, "points": points}
+
+
+@pytest.mark.parametrize(
+    ("errors_mm", "level_mm", "axis", "expected"),
+    [
+        ((20.0, 12.0, 8.0, 11.0, 4.0), 10, "wall_s", 27.0),  # half way from 22 to 32
+        ((20.0, 12.0, 8.0, 11.0, 4.0), 5, "env_steps", 400 + 100 * 6 / 7),
+        ((20.0, 12.0, 8.0, 11.0, 4.0), 3, "wall_s", None),
+        ((4.0, 3.0), 5, "wall_s", 12.0),  # at its first evaluation
+        ((20.0, None, 4.0), 5, "wall_s", 32.0),  # nothing to draw the line from
+    ],
+)
+def test_a_level_is_reached_where_the_line_between_two_evaluations_crosses_it_first(
+    errors_mm, level_mm, axis, expected
+):
+    where = crossing(result("", *errors_mm)["points"], level_mm, axis)
+    assert where is None if expected is None else where == pytest.approx(expected)
+
+
+SBX, SLOW = "sbx-hindsight", [9.0] * 30  # 302 s
+QUICK, FAST = result("ours-quick", 6.0, 4.0), result("ours-quick", 4.0)  # 5 mm at 17 s; at 12 s
+FAILED = {"contestant": "ours-quick", "seed": 0, "failed": "no network"}
+
+
+@pytest.mark.parametrize(
+    ("results", "judged"),
+    [
+        ([QUICK, result(SBX, *[9.0] * 8, 6.0, 4.0)], ("5.71 times", "met")),  # 97 s
+        ([QUICK, result(SBX, 9.0, 9.0, 6.0, 4.0)], ("2.18 times", "NOT MET")),  # 37 s
+        ([QUICK, result(SBX, 9.0, 9.0, 6.0)], ("not within 1.88 times", "skipped")),
+        ([FAST, result(SBX, *SLOW)], ("not within 25.17 times", "met")),
+        (
+            [FAST, result(SBX, *SLOW), result("ours-quick", 4.0, seed=1)],
+            (f"not raced: {SBX}, seed 1", "skipped"),
+        ),
+        ([result("ours-quick", 6.0), result(SBX, *SLOW)], ("ours did not reach it with seed 0", "NOT MET")),
+        ([FAILED], ("ours-quick, seed 0: no network", "NOT MET")),
+    ],
+)
+def test_a_target_is_the_peer_s_time_over_ours_once_both_have_raced_with_all_seeds(results, judged):
+    row = judge(PeerTarget(SBX, 5.0), results)
+    assert (row["measured"], row["verdict"]) == judged
 
 
 @pytest.fixture
 def asked(monkeypatch):
-    """Limits that each contestant was given, in place of training it; some of them fail."""
+    """Limits that each contestant was given, in place of training it; one of them fails."""
     asked = {}
 
     def made_up(worker, limits):
         asked[worker.name] = limits
-        if worker.name in ("sbx-hindsight, seed 0", "ours-quick, seed 3"):
+        if worker.name == "ours-quick, seed 3":
             raise WorkerError(f"{worker.name}: got status 1")
-        return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
+        return {key: result("", 12.0, 8.0, 4.0)[key] for key in ("start_up_s", "limit_s", "points")}
 
     monkeypatch.setattr(race, "train", made_up)
     monkeypatch.setattr(race, "peer_python", lambda name: PINS[name] and sys.executable)
     return asked
 
 
-def race_in(folder, seeds=(0,), n_goals=8):
-    return run(folder, seeds, CONTESTANTS, n_goals)
-
-
 def test_peers_get_our_time_to_5_mm_as_often_as_the_target_asks_and_stop_where_ours_did(asked, tmp_path):
-    results = race_in(tmp_path, (4,))
+    assert all("points" in one for one in run(tmp_path, (4,), CONTESTANTS, 8))
     sbx, sb3 = (RaceLimits(n * 29.5, 5, n * 29.5 / 40) for n in (20, 15))  # SBX: 5 times quick, 20 analytic
-    assert asked == {
-        "ours-quick, seed 4": RaceLimits(),
-        "ours-analytic, seed 4": RaceLimits(float("inf"), 1, 5 * 29.5 / 40),
-        "sbx-hindsight, seed 4": sbx,
-        "sb3-contrib-hindsight, seed 4": sb3,
-    }
-    assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]
-    assert all("points" in one for one in results)
+    ours = (RaceLimits(), RaceLimits(float("inf"), 1, 5 * 29.5 / 40))
+    given = zip(CONTESTANTS, (*ours, sbx, sb3), strict=True)
+    assert list(asked.items()) == [(f"{name}, seed 4", limits) for name, limits in given]
     # One that does not reach 5 mm: multiples of all its time.
-    quick = {"contestant": "ours-quick", "points": POINTS[:2]}
+    quick = result("ours-quick", 12.0, 8.0)
     assert limits_of("sbx-hindsight", [quick]) == RaceLimits(5 * 22.0, 10, 5 * 22.0 / 40)
-    # Each target has the time of its own preset.
-    quick, analytic = ({"contestant": f"ours-{name}", "points": POINTS} for name in ("quick", "analytic"))
-    analytic["points"] = [POINTS[2] | {"wall_s": 5.0}]
-    assert limits_of("sbx-hindsight", [quick, analytic]).wall_s == 5 * 29.5  # 20 times 5 s are less
+    # Without the first there is no race of a seed.
+    assert [one["contestant"] for one in run(tmp_path, (3,), CONTESTANTS, 8)] == ["ours-quick"]
 
 
-def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(asked, monkeypatch, tmp_path):
-    monkeypatch.setattr(race, "save", lambda *_: tmp_path / "race.json")
-    assert main(["race", "--only", "sbx-hindsight", "--out", str(tmp_path)]) == 0  # it fails
-    assert list(asked) == ["ours-quick, seed 0", "sbx-hindsight, seed 0"]
-    asked.clear()
-    assert main(["race", "--out", str(tmp_path)]) == 1  # as fast as ours
-    assert list(asked) == [f"{name}, seed 0" for name in CONTESTANTS if name != "ours-quick"]
-
-
-def test_results_of_another_commit_size_or_machine_are_refused(asked, monkeypatch, tmp_path):
+def test_results_are_kept_and_those_of_another_commit_size_or_machine_refused(asked, monkeypatch, tmp_path):
     made = {"commit": "a", "uncommitted_changes": True, "packages": {"jax": "1"}, "command": "this"}
     monkeypatch.setattr(race, "provenance", lambda program: dict(made))
     monkeypatch.setattr(race, "machine_kind", lambda: "Abacus, 2 cores")
-    before = race_in(tmp_path)
-    assert {(one["commit"], one["uncommitted_changes"]) for one in before} == {("a", True)}
-    made |= {"command": "that", "uncommitted_changes": False}
-    assert race_in(tmp_path) == [one | {"uncommitted_changes": "failed" not in one} for one in before]
+    before = run(tmp_path, (0,), CONTESTANTS, 8)
+    asked.clear()
+    assert run(tmp_path, (0,), CONTESTANTS, 8) == before and not asked
     with pytest.raises(RaceError, match="got n_goals 8, expected n_goals 9"):
-        race_in(tmp_path, n_goals=9)
+        run(tmp_path, (0,), CONTESTANTS, 9)
     made["commit"] = "b"
-    with pytest.raises(
-        RaceError, match=r"ours-quick-seed0.json: got commit a, expected commit b; choose another"
-    ):
-        race_in(tmp_path)
-    made["commit"] = "a"
-    monkeypatch.setattr(race, "machine_kind", lambda: "Abacus, 4 cores")
-    with pytest.raises(RaceError, match="got machine Abacus, 2 cores, expected machine Abacus, 4 cores"):
-        race_in(tmp_path)
-
-
-def test_without_the_first_there_is_no_race_and_other_seeds_are_told(asked, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(race, "save", lambda *_: pytest.fail("written"))
-    assert main(["race", "--seeds", "1,3", "--out", str(tmp_path)]) == 2
-    said = capsys.readouterr()
-    assert "ours-quick" in said.err
-    assert "got status 1" in said.out and "29.5" in said.out
-    assert not list(tmp_path.glob("*seed3.json"))
-    assert len(list(tmp_path.glob("*seed1.json"))) == len(CONTESTANTS)
-
-
-@pytest.mark.parametrize(
-    "times, chosen",
-    [
-        ({4: [9.0, 1.0, 1.0, 1.0], 1: [3.0] * 4}, 4),
-        ({4: [50.0] * 4, 1: [9.0, 60.0, 3.0, 70.0]}, 1),  # the best of three, after one that does not count
-        ({4: [50.0] * 4, 1: [3.0, 60.0, 60.0, 60.0]}, 4),
-    ],
-)
-def test_pytorch_gets_the_threads_it_trains_fastest_with(monkeypatch, times, chosen):
-    threads, clock = [4], [0.0]
-    torch = SimpleNamespace(
-        get_num_threads=lambda: threads[0], set_num_threads=lambda n: threads.__setitem__(0, n)
-    )
-    monkeypatch.setitem(sys.modules, "torch", torch)
-    monkeypatch.setattr("benchmarks.race.threads.time.perf_counter", lambda: clock[0])
-    left = {n: iter(own) for n, own in times.items()}
-    choose_threads(lambda: clock.__setitem__(0, clock[0] + next(left[threads[0]])))
-    assert threads == [chosen]
+    with pytest.raises(RaceError, match="ours-quick-seed0.json: got commit a, expected commit b; choose"):
+        run(tmp_path, (0,), CONTESTANTS, 8)

@@ -25,28 +25,6 @@ STORED = samples(  # medians of three of these lie from 0.92 to 1.02 and from 2.
 )
 
 
-class Program:
-    """In place of a worker: each round takes a second less."""
-
-    def __init__(self, name, program, n_cores):
-        assert program == ["benchmarks.speed.guard"] and n_cores == 1
-        self.name, self.facts, self.n = name, {"compile": 30.0}, 0
-
-    def start(self): ...
-
-    def close(self): ...
-
-    def round(self):
-        self.n += 1
-        return {"product": 14.0 - self.n, "settle": 14.0 - self.n, "epoch": 28.0 - self.n}
-
-
-def test_a_cost_is_the_least_time_over_that_of_the_product_in_a_process_on_one_core(monkeypatch):
-    monkeypatch.setattr(guard, "Worker", Program)
-    assert guard.N_ROUNDS == 12
-    assert guard.process_costs() == {"settle": 1.0, "epoch": 8.0, "compile": 15.0}
-
-
 def test_tolerance_is_twice_the_furthest_median_of_as_many_as_are_compared_or_a_tenth():
     baseline = baseline_of(STORED)
     assert baseline["settle"]["cost"] == 1.0 and baseline["settle"]["tolerance"] == pytest.approx(0.16)
@@ -93,20 +71,6 @@ def test_status_tells_stored_same_worse_and_no_baseline(machine, monkeypatch, ca
     assert guard.main() == guard.WORSE
     monkeypatch.setattr(guard, "process_costs", Mock(side_effect=WorkerError("guard: no memory")))
     assert main(["guard"]) == 2 and capsys.readouterr().err == "error: guard: no memory\n"
-
-
-def test_baselines_of_other_machines_stay_and_those_of_other_work_are_not_compared(machine, monkeypatch):
-    for kind, n_arms in ((KIND, 128), ("Slide rule, 4 cores", 64)):
-        monkeypatch.setattr(guard, "cpu_kind", lambda kind=kind: kind)
-        monkeypatch.setitem(guard.SIZES, "n_arms", n_arms)
-        machine += STORED
-        assert guard.main(store=True) == 0
-    machine += samples(epoch=(2.0,) * 3)
-    assert guard.main() == 0
-    assert json.loads(guard.FILE.read_text())["kinds"].keys() == {KIND, "Slide rule, 4 cores"}
-    monkeypatch.setattr(guard, "cpu_kind", lambda: KIND)
-    with pytest.raises(InputError, match="got no baseline"):
-        guard.main()
 
 
 def test_an_uncertain_baseline_is_not_stored(machine):

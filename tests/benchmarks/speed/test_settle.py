@@ -2,13 +2,11 @@
 
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.speed import settle
-from benchmarks.speed.truth import Truth, error_figures, random_references, settle_function
+from benchmarks.speed.truth import Truth, error_figures
 from tests.train.small import SHORT
-from train.epoch.devices import mesh_of
 
 
 def truth(tip_mm, settled=None):
@@ -56,10 +54,3 @@ def test_arms_that_stand_are_counted_by_where_they_end(monkeypatch):
     assert (row["converged"], row["not_convex"]) == (3, 1)
     assert (row["settled_and_rest"], row["elsewhere"], row["settled_but_moves"]) == (2, 1, 1)
     assert row["rests_but_not_settled"] == 1 and row["max_mm"] == 0.0173
-
-
-def test_spread_arms_settle_as_on_one_device(quick_compiler):
-    reference = jnp.asarray(random_references(SHORT, 8), jnp.float32)
-    one, spread = (settle_function(SHORT, mesh=mesh)(reference) for mesh in (None, mesh_of("2")))
-    assert len(spread.q.sharding.device_set) == 2
-    np.testing.assert_allclose(spread.q, one.q, atol=1e-5)

@@ -1,15 +1,17 @@
 """The throughput benchmark: C MuJoCo's rest against the solver, rows of programs that take turns."""
 
-import itertools
+import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
+from benchmarks.__main__ import main
 from benchmarks.harness.peers import PeerError
 from benchmarks.harness.rounds import ROOT
 from benchmarks.speed import throughput
+from benchmarks.speed.jax_worker import Program, rates
 from benchmarks.speed.mujoco_arms import (
     REST_M,
     REST_S,
@@ -136,7 +138,7 @@ def test_rates_are_medians_over_rounds_and_arrays_are_left_out():
     assert over_rounds([{"env_steps_per_s": 5.678}]) == {"env_steps_per_s": 5.68}
 
 
-def test_everything_asked_for_is_measured(monkeypatch):
+def test_programs_beside_others_have_a_row_each_or_a_reason(monkeypatch):
     asked = []
 
     def take_turns(workers, n_rounds):
@@ -150,29 +152,89 @@ def test_everything_asked_for_is_measured(monkeypatch):
     monkeypatch.setattr(throughput, "take_turns", take_turns)
     monkeypatch.setattr(throughput, "peer_python", peer_python)
     monkeypatch.setattr(throughput, "write_arm", lambda *_: None)
-    found = throughput.measure()
-    over_arms = {(row["engine"], row["mode"], row["arms"]): row for row in found["over_arms"]}
-    programs = itertools.product(("chain", "mjx"), ("quasistatic", "dynamic"))
-    assert over_arms.keys() == {(*program, n) for program in programs for n in (1, 128, 1024)}
-    assert over_arms["chain", "quasistatic", 1]["env_steps_per_s"] == 200
-    assert over_arms["mjx", "dynamic", 1]["failed"] == "no memory"
-    assert found["side_by_side"][-2]["skipped"] == "sb3-contrib: no network"
-    assert [row["skipped"] for row in found["simulated_time"][3:]] == ["soromox: no network"] * 2
-    assert [len(names) for names in asked] == [4, 4, 4, 3, 3]
+    figures = throughput.beside_peers()
+    assert figures["side_by_side"][0]["env_steps_per_s"] == 200
+    assert [row.get("failed") for row in figures["side_by_side"][:3]] == [None, None, "no memory"]
+    assert figures["side_by_side"][-2]["skipped"] == "sb3-contrib: no network"
+    assert [row["skipped"] for row in figures["simulated_time"][2:]] == ["soromox: no network"] * 2
+    at_rest = asked[0][:2]
+    assert at_rest == ["mjx, quasistatic, 1024 arms", "chain, quasistatic, 1024 arms"]  # equals
 
 
-def test_rates_are_told_as_multiples_of_the_processes_beside_the_paper_s():
+def test_rates_are_multiples_of_c_mujoco_s_in_threads_and_in_processes_beside_the_paper_s():
     rows = side_by_side(
         [
             {"program": "chain", "env_steps_per_s": 5000},
             {"program": "C MuJoCo, SubprocVecEnv, 2 processes", "env_steps_per_s": 50, "p95_mm": 0.5},
-            {"program": "C MuJoCo, rollout", "skipped": "no device"},
+            {"program": "C MuJoCo, rollout, 2 threads", "env_steps_per_s": 100},
+            {"program": "absent", "skipped": "no device"},
         ]
     )
-    assert [row.get("times_subproc") for row in rows] == [100, 1.0, None, None]
-    assert rows[2]["skipped"] == "no device" and rows[1]["p95_mm"] == 0.5
-    assert rows[3]["env_steps_per_s"] == 467  # the paper's
+    assert [row.get("times_subproc") for row in rows] == [100, 1.0, 2.0, None, None]
+    assert [row.get("times_rollout") for row in rows] == [50, 0.5, 1.0, None, None]
+    assert rows[3]["skipped"] == "no device" and rows[1]["p95_mm"] == 0.5
+    assert rows[4]["env_steps_per_s"] == 467  # the paper's
     assert side_by_side([{"program": "chain", "env_steps_per_s": 5000}])[0]["times_subproc"] is None
+
+
+def test_rates_leave_out_the_first_call_unless_it_is_long(monkeypatch):
+    clock = iter([0.0, 0.4, 0.9, 1.4, 0.0, 3.0])
+    monkeypatch.setattr("benchmarks.speed.jax_worker.time.perf_counter", lambda: next(clock))
+    program = Program(0.0, lambda: np.zeros(1), n_env_steps=100, n_updates=5)
+    assert rates(program, 1.0) == {"env_steps_per_s": pytest.approx(200), "updates_per_s": pytest.approx(10)}
+    assert rates(program, 1.0)["env_steps_per_s"] == pytest.approx(100 / 3)
+
+
+@pytest.mark.parametrize(
+    "options", [["--engine", "chain", "--mode", "quasistatic"], ["--train", "--engine", "chain"]]
+)
+def test_a_table_of_this_machine_and_its_file(options, tmp_path, capsys, monkeypatch):
+    def program(*_):
+        return Program(1.5, lambda: np.zeros(1), 1_000_000, 10 * ("--train" in options))
+
+    for name in ("rollout", "training", "gradient_steps"):
+        monkeypatch.setattr(throughput, name, program)
+    monkeypatch.setattr(
+        throughput, "rates", lambda program, s: {"env_steps_per_s": 2e4, "updates_per_s": 300.0}
+    )
+    monkeypatch.setattr(throughput.jax.config, "update", lambda *_: None)
+    monkeypatch.setattr(throughput.xla, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(throughput, "n_cores", lambda: 1)
+    file = tmp_path / "speed.json"
+    assert main(["throughput", "--arms", "8", "16", "--seconds", "0.01", "--json", str(file), *options]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["chain", "quasistatic", "8", "1.5", "20,000", "300"] in lines
+    written = json.loads(file.read_text())
+    assert [(row["arms"], row["compile_s"]) for row in written["rows"]] == [(8, 1.5), (16, 1.5)]
+    assert written["train"] == ("--train" in options) and "commit" in written
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--arms", "0"], "--arms: got 0, expected numbers from 1"),
+        (["--devices", "0"], "--devices: got 0, expected a number from 1"),
+        (["--engine", "fem"], "--engine: got fem, expected some of mjx, chain, mjx-step, warp"),
+        (["--mode", "rest"], "--mode: got rest, expected some of quasistatic, dynamic"),
+        (
+            ["--engine", "chain", "--mode", "dynamic"],
+            "--engine: got chain with --mode dynamic, expected mjx,",
+        ),
+        (["--seconds", "0"], "--seconds: got 0, expected a finite number > 0"),
+        (["--json", "absent/speed.json"], "--json: got absent/speed.json, expected a file in a folder that"),
+        (["--peers", "--train"], "--peers: got other options too, expected --json at most"),
+    ],
+)
+def test_misuse_is_a_line(options, message, capsys):
+    assert main(["throughput", *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.mark.parametrize("train", [False, True])
+def test_a_program_of_each_kind_runs(train):
+    row = throughput.row_of(throughput.Point("chain", "quasistatic", 8), 1, 0.1, train)
+    assert row["env_steps_per_s"] > 0 and row["compile_s"] > 0.1 and ("updates_per_s" in row) == train
 
 
 def test_a_round_of_steps_has_its_rate_and_the_simulated_time_of_a_step(monkeypatch):

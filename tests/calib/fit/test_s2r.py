@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.calibration.logs import trunk_errors
+from benchmarks.accuracy.calibration import trunk_errors
 from calib.fit.blocks import held_out_blocks
 from calib.fit.network import OF_ROWS, NetworkConfig, fit_network
 from calib.fit.pose_errors import pose_errors

@@ -10,7 +10,6 @@ from calib.read.logs import read_log
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.capture import Delay, with_capture
-from mjx_softarm.deploy.capture.system import CaptureName
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
 from tests.deploy.capture.conftest import Arm
@@ -94,39 +93,31 @@ def test_an_arm_that_stands_is_seen_above_its_base(serve, opened):
 
 
 @pytest.mark.parametrize(
-    "name",
+    ("name", "message"),
     [
-        "natnet",
-        "vicon:host:tip",
-        "natnet:host",
-        "qualisys::tip",
-        "natnet:host:tip,left=x",
-        "natnet:host:tip,base",
-        "natnet:host:tip,base=b,markers=",
+        *(
+            (name, "expected natnet:HOST:BODY or qualisys:HOST:BODY")
+            for name in ("natnet", "vicon:host:tip", "natnet:host", "qualisys::tip", "natnet:host:tip,left=x")
+        ),
+        ("natnet:host:tip,base=b,markers=", "expected natnet:HOST:BODY or qualisys:HOST:BODY"),
+        ("natnet:host:tip,up=x", "got up=x, expected y or z"),
+        ("natnet:host:tip", "an arm with its own motion capture"),
     ],
 )
-def test_malformed_names(name):
-    with pytest.raises(InputError, match="expected natnet:HOST:BODY or qualisys:HOST:BODY"):
-        CaptureName.read(name)
-
-
-def test_up_is_y_or_z_and_an_arm_has_one_motion_capture():
-    with pytest.raises(InputError, match="got up=x, expected y or z"):
-        CaptureName.read("natnet:host:tip,up=x")
+def test_names_that_are_refused(name, message):
     own = type("Own", (Arm,), {"motion_capture": lambda self: None})()
-    with pytest.raises(InputError, match="an arm with its own motion capture"):
-        with_capture(own, "natnet:host:tip", SPEC, print)
-    assert with_capture(own, None, SPEC, print) is own
+    with pytest.raises(InputError, match=message):
+        with_capture(own, name, SPEC, print)
 
 
 def test_delay_ignores_the_clocks_difference_and_their_slow_drift():
     delay = Delay()
     for k in range(100_000):  # 1000 s; the server's clock loses 100 ppm
         now_s = 0.01 * k
-        found_s = delay.of(5e6 + now_s * (1.0 - 1e-4), now_s)
-    assert found_s < 1e-3
-    assert delay.of(5e6 + now_s * (1.0 - 1e-4), now_s + 0.2) == pytest.approx(0.2, abs=2e-3)
-    assert delay.of(3.0, now_s + 0.21) == 0.0  # the clock begins anew
+        delay_s = delay.measure(5e6 + now_s * (1.0 - 1e-4), now_s)
+    assert delay_s < 1e-3
+    assert delay.measure(5e6 + now_s * (1.0 - 1e-4), now_s + 0.2) == pytest.approx(0.2, abs=2e-3)
+    assert delay.measure(3.0, now_s + 0.21) == 0.0  # the clock begins anew
 
 
 DRIVER = """

@@ -1,8 +1,8 @@
-"""Accuracy of calibration on public logs of real soft arms.
+"""Accuracy of calibration, on a planted arm whose numbers are known and on public logs of real soft arms.
 
-`asl_trunk` is a trunk of three segments and six motors (StanfordASL/trunk-stack), `asu_softarm` a pneumatic
-arm of two sections with draw wires (ASU-RISE-Lab/4-chamber-softarm-control). Errors are on contiguous blocks
-of rows that took no part in the fit. All rows are kept; `fresh` marks those with renewed motion capture.
+Errors are on contiguous blocks of rows that took no part in the fit. `asl_trunk` is a trunk of three segments
+and six motors (StanfordASL/trunk-stack), `asu_softarm` a pneumatic arm of two sections with draw wires
+(ASU-RISE-Lab/4-chamber-softarm-control). All rows are kept; `fresh` marks those with renewed motion capture.
 
 Source: ASU-RISE-Lab/4-chamber-softarm-control (commit 6df7ec9d), StanfordASL/trunk-stack (commit 8b4b9234).
 """
@@ -10,15 +10,23 @@ Source: ASU-RISE-Lab/4-chamber-softarm-control (commit 6df7ec9d), StanfordASL/tr
 from __future__ import annotations
 
 import itertools
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from calib import demo
 from calib.fit.blocks import held_out_blocks
+from calib.fit.chambers import fit_chambers
 from calib.fit.lines import fit_line
 from calib.fit.network import fit_network
+from calib.fit.sensors import fit_springs
+from calib.read.logs import read_log
+from calib.read.measurements import measure as measurements_of
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import cli
 from mjx_softarm.logs import checks
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.schema import UNITS
@@ -34,15 +42,48 @@ N_BODIES = 3
 WIRE_M_PER_V = 1.0 / 5.0  # draw-wire encoders: 5 V at 1 m, up to an offset that differs from day to day
 
 
-def measure(data: Path) -> dict[str, Any]:
-    """How well do calibrated lines and the sim-to-real network predict logs of real arms, in mm?
+def measure(data: cli.MaybePath = None) -> dict[str, Any]:
+    """How exact is calibration, on a planted arm and, with --data, on logs of real arms?
 
     Args:
-        data: folder with `asl_trunk` and `asu_softarm`.
+        data: folder with `asl_trunk` and `asu_softarm`; None: the planted arm alone
 
     Raises:
         LogError: a log is missing, or cannot be read.
     """
+    return {"planted arm": planted_arm(), **(real_logs(data) if data else {})}
+
+
+def planted_arm() -> dict[str, float]:
+    """Return errors of the numbers of `python -m calib demo`, whose geometry differs from the simulator's.
+
+    Tips are in mm.
+    """
+    spec = ArmSpec.default()
+    planted = demo.planted_arm(spec, seed=0)
+    with tempfile.TemporaryDirectory() as folder:
+        files = demo.write_demo(Path(folder), spec, seed=0)
+        springs, poses = (read_log(file)[0] for file in files[:2])
+    assert springs.readings is not None and springs.spring_m is not None  # as the demo writes them
+    lines = fit_springs(springs.readings, springs.spring_m, spec.spring_sensor)
+    sensor = {"beta": tuple(map(float, lines.beta)), "delta_m": tuple(map(float, lines.delta_m))}
+    fit = fit_chambers(measurements_of([poses], spec), spec.replace(sensor=sensor))
+    return {
+        "beta, largest error [%]": 100 * _worst(lines.beta, planted.sensor.beta),
+        "stiffness, largest error [%]": 100
+        * _worst(fit.spec.chambers.stiffness_n_per_m, planted.chambers.stiffness_n_per_m),
+        "area, largest error [%]": 100 * _worst(fit.spec.chambers.area_m2, planted.chambers.area_m2),
+        "tip at held-out poses, before": fit.held_out_before.translation_mean_mm,
+        "tip at held-out poses, calibrated": fit.held_out.translation_mean_mm,
+    }
+
+
+def _worst(fitted: Any, true: Any) -> float:
+    return float(np.max(np.abs(np.array(fitted) / np.array(true) - 1.0)))
+
+
+def real_logs(data: Path) -> dict[str, Any]:
+    """Return errors [mm] of calibrated lines and of the sim-to-real network on logs of real arms."""
     return {
         "draw wires to section length, RMS": {name: wires(data, name) for name in ASU_LOGS},
         "trunk, 3D RMSE": {
@@ -154,7 +195,6 @@ class AsuLog(NamedTuple):
 
     time_s: np.ndarray  # (n,)
     pressure_kpa: np.ndarray  # (n, 6) measured in section 1, then section 2, relative to the atmosphere
-    commanded_kpa: np.ndarray  # (n, 6) desired in the same chambers
     wire_m: np.ndarray  # (n, 4) draw wires from the base: section 1 left, 1 right, 2 right, 2 left
     position_m: np.ndarray  # (n, 3, 3) base, middle, tip
     quaternion: np.ndarray  # (n, 3, 4) w, x, y, z as logged
@@ -192,7 +232,6 @@ def read_asu(path: Path) -> AsuLog:
     return AsuLog(
         time_s=values[:, 0],
         pressure_kpa=UNITS["pressure"]["psi"] * psi[:, 1],
-        commanded_kpa=UNITS["pressure"]["psi"] * psi[:, 0],
         wire_m=WIRE_M_PER_V * values[:, 13:17],
         position_m=body[..., :3],
         quaternion=body[..., [6, 3, 4, 5]],
@@ -218,7 +257,7 @@ def read_trunk(path: Path) -> TrunkLog:
 
 
 def _columns(path: Path, names: list[str], header: bool) -> np.ndarray:
-    """Return the columns (n, k) of a file by their names, which only a header tells."""
+    """Return the columns (n, k) of a file by their names, from its header or as given."""
     table = read_table(path, None if header else names)
     if missing := [name for name in names if name not in table.names]:
         problem = "got no such columns, expected those of the public log"

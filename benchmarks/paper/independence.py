@@ -1,6 +1,6 @@
 """The paper's claims of load-independence and of no saturation, in simulation, one cause changed at a time.
 
-All policies learn alike, through the gradient of the simulated equilibrium; `KINDS` says in which settings
+All policies learn alike, through the gradient of the simulated equilibrium; `POLICIES` says in which settings
 they differ. A policy may command nine pressures in place of nine spring lengths, which the sensor-space law
 holds. The loss's term that pulls references of saturated chambers back may be left out; pressures have no
 references, so they always go without it. Some kinds learn with payloads, and some of these observe them.
@@ -13,7 +13,9 @@ pressures. It goes to some of the goals without a payload, with as many searches
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -23,8 +25,10 @@ from jax import Array
 
 from benchmarks.harness.common import grouped
 from benchmarks.paper.gradient_descent import gradient_descent
+from benchmarks.paper.trials import Settings
 from mjx_softarm import ArmSpec
-from mjx_softarm._support import cli, xla
+from mjx_softarm._support import xla
+from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.state import PAYLOAD_SHARE, State
 from mjx_softarm.mdp.actions import N_ACTIONS
@@ -32,10 +36,10 @@ from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.agent.registry import World, learner_of
-from train.config import TrainConfig, override
+from train.config import override
 from train.presets import PRESETS
 from train.runs import evaluate
-from train.runs.evaluate import N_GOALS, Reached, paths_of, start_keys, towards
+from train.runs.evaluate import Reached, paths_of, start_keys, towards
 from train.runs.task import task_of
 
 LOADS_G = (0, 250, 500, 1000)
@@ -55,8 +59,8 @@ class PressureEnv(ReachEnv):
         return super().step(state, self.action_of(held.spring_m + arm.sensor_offset_m))
 
 
-class PolicyKind(NamedTuple):
-    """Environment and settings of a kind of policy."""
+class Commands(NamedTuple):
+    """What a policy commands, and how it learns."""
 
     settings: tuple[str, ...]  # NAME=VALUE
     env: Callable[..., ReachEnv] = ReachEnv
@@ -69,58 +73,64 @@ LARGEST_KG = ArmSpec.default().mass.largest_payload_kg
 LOADED = f"env.randomisation.payload_max_kg={LARGEST_KG}"
 OBSERVED = "env.observation=payload"
 NO_TERM = "learner.saturation_cost_per_mm=0"
-KINDS = {
-    "spring lengths": PolicyKind((FAST,)),
-    "no saturation term": PolicyKind((SLOW, NO_TERM)),
-    "pressures": PolicyKind((SLOW, NO_TERM), PressureEnv),  # the term would read actions as spring lengths
-    "spring lengths, learned with payloads": PolicyKind((FAST, LOADED)),
-    "spring lengths, payload observed": PolicyKind((FAST, OBSERVED)),
-    "pressures, payload observed": PolicyKind((FAST, OBSERVED, NO_TERM), PressureEnv),
+POLICIES = {
+    "spring lengths": Commands((FAST,)),
+    "no saturation term": Commands((SLOW, NO_TERM)),
+    "pressures": Commands((SLOW, NO_TERM), PressureEnv),  # the term would read actions as spring lengths
+    "spring lengths, learned with payloads": Commands((FAST, LOADED)),
+    "spring lengths, payload observed": Commands((FAST, OBSERVED)),
+    "pressures, payload observed": Commands((FAST, OBSERVED, NO_TERM), PressureEnv),
 }
 
 
-def measure(
-    seeds: cli.Integers = (0, 1, 2), steps: int = 1_048_576, goals: int = N_GOALS, arms: int = 64
-) -> dict[str, Any]:
-    """Do spring lengths make a policy independent of the load, and does it avoid saturated chambers?
+def results_of(name: str, seeds: Iterable[int]) -> tuple[str, ...]:
+    """Return the files of a kind of policy, or of the solver, in the folder."""
+    words = name.replace(",", "").replace(" ", "-")
+    return tuple(f"independence/{words}-seed{seed}.json" for seed in seeds)
 
-    Args:
-        seeds: of training
-        steps: environment steps of training
-        goals: held-out goals of each of the two sets
-        arms: of a gradient step
-    """
-    spec, loads = ArmSpec.default(), []
-    base = override(PRESETS["analytic"], [f"learner.total_env_steps={steps}", f"learner.n_arms={arms}"])
-    # Policies, at all goals with each payload.
-    for name, kind in KINDS.items():
-        trained = PolicyTrial(kind, override(base, kind.settings), spec, goals)
-        for seed in seeds:
-            loads += [{"commands": name, "seed": seed, **row} for row in trained.run(seed)]
-    # Gradient descent, at some goals without one.
-    descent = Descent(ReachEnv(spec), goals)
-    loads += [{"commands": SOLVER, "seed": seed, "load_g": 0, **descent.run(seed)} for seed in seeds]
+
+def measure(folder: Path, settings: Settings, name: str) -> None:
+    """Train policies of a kind, or take the solver, and write the errors of each seed with each payload."""
+    (folder / "independence").mkdir(exist_ok=True)
+    rows_of = descent(settings) if name == SOLVER else PolicyTrial(name, settings).rows
+    for seed, path in zip(settings.seeds, results_of(name, settings.seeds), strict=True):
+        if not (folder / path).exists():
+            write_json(folder / path, rows_of(seed))
+
+
+def figures_of(folder: Path, settings: Settings) -> dict[str, Any]:
+    """Return the figures of all seeds, and their means."""
+    runs = [
+        {"commands": name, "seed": seed, **row}
+        for name in (*POLICIES, SOLVER)
+        for seed, path in zip(settings.seeds, results_of(name, settings.seeds), strict=True)
+        for row in json.loads((folder / path).read_text("utf-8"))
+    ]
     return {
-        "settings": {"seeds": list(seeds), "env_steps": steps, "goals": goals},
-        "under loads": means(loads, ("commands", "load_g")),
-        "loads of all runs": loads,
+        "env_steps": settings.independence_steps,
+        "goals": settings.n_goals,
+        "under loads": means(runs, ("commands", "load_g")),
+        "loads of all runs": runs,
     }
 
 
 class PolicyTrial:
     """Training and evaluation of one kind of policy, each compiled once."""
 
-    def __init__(self, kind: PolicyKind, config: TrainConfig, spec: ArmSpec, n_goals: int):
-        self.config, self.n_goals = config, n_goals
-        loaded = Randomisation(payload_max_kg=LARGEST_KG)
-        env = kind.env(spec, EnvConfig(observation=config.env.observation, randomisation=loaded))
-        self.paths = paths_of(jnp.concatenate(goals_of(env, n_goals)))
+    def __init__(self, name: str, settings: Settings):
+        xla.enable_compilation_cache()
+        steps = f"learner.total_env_steps={settings.independence_steps}"
+        kind, spec = POLICIES[name], ArmSpec.default()
+        self.config, self.n_goals = override(PRESETS["analytic"], [steps, *kind.settings]), settings.n_goals
+        seen, loaded = self.config.env.observation, Randomisation(payload_max_kg=LARGEST_KG)
+        env = kind.env(spec, EnvConfig(engine="chain", observation=seen, randomisation=loaded))
+        self.paths = paths_of(jnp.concatenate(goals_of(env, self.n_goals)))
         self.keys = start_keys(len(self.paths))
-        self._job = task_of(config, kind.env(spec, config.env)).job
-        one = functools.partial(follow, env, learner_of(config.learner, World(env)))
+        self._job = task_of(self.config, kind.env(spec, self.config.env)).job
+        one = functools.partial(follow, env, learner_of(self.config.learner, World(env)))
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
 
-    def run(self, seed: int) -> list[dict[str, Any]]:
+    def rows(self, seed: int) -> list[dict[str, Any]]:
         """Train one policy; return its figures with each payload."""
         state = self._job.start(lambda: self._job.init(jax.random.PRNGKey(seed)))
         for _ in range(self.config.learner.n_epochs):
@@ -157,39 +167,38 @@ def figures(off_mm: np.ndarray, n_saturated: np.ndarray) -> dict[str, float]:
     }
 
 
-class Descent:
-    """Gradient descent by the estimator of the policy that ships; it knows of no payload."""
+def descent(settings: Settings) -> Callable[[int], list[dict[str, Any]]]:
+    """Return a function, seed -> figures of gradient descent, which knows of no payload.
 
-    def __init__(self, env: ReachEnv, n_goals: int):
-        self.env, self.solve = env, gradient_descent(load_policy(SHIPPED))
-        self.step, self.reset = xla.jit(env.step), xla.jit(env.reset)
-        self.sets = [np.asarray(poses) for poses in goals_of(env, n_goals)]
+    It goes to some goals of both sets, other ones for each seed, from a random pose, by the estimator of the
+    policy that ships.
+    """
+    env, solve = ReachEnv(config=EnvConfig(engine="chain")), gradient_descent(load_policy(SHIPPED))
+    step, reset = xla.jit(env.step), xla.jit(env.reset)
+    sets = [np.asarray(poses) for poses in goals_of(env, settings.n_goals)]
 
-    def run(self, seed: int) -> dict[str, float]:
-        """Return its figures at some goals of both sets, other ones for each seed, from a random pose."""
-        rng = np.random.default_rng(seed)
-        some = [rng.choice(poses, min(N_SOLVED, len(poses)), replace=False) for poses in self.sets]
-        return figures(*self.along(np.concatenate(some), jax.random.PRNGKey(seed)))
-
-    def along(self, path: np.ndarray, key: Array) -> np.ndarray:
-        """Return tip errors [mm] and saturated chambers (2, n) at the goals of a path (n, 6)."""
-        state, found = self.reset(key), []
-        for goal in path:
+    def rows(seed: int) -> list[dict[str, Any]]:
+        rng, state = np.random.default_rng(seed), reset(jax.random.PRNGKey(seed))
+        ends = []
+        for goal in np.concatenate(
+            [rng.choice(poses, min(N_SOLVED, len(poses)), replace=False) for poses in sets]
+        ):
             for _ in range(N_ACTIONS):
                 arm = state.pipeline_state
-                spring_m = self.solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
-                action = self.env.action_of(jnp.asarray(spring_m))
-                state = self.step(towards(self.env, state, goal), action)
-            found.append([float(state.metrics[name]) for name in ("tip_error_mm", "saturated_chambers")])
-        return np.array(found).T
+                spring_m = solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
+                state = step(towards(env, state, goal), env.action_of(jnp.asarray(spring_m)))
+            ends.append([float(state.metrics[name]) for name in ("tip_error_mm", "saturated_chambers")])
+        return [{"load_g": 0, **figures(*np.array(ends).T)}]
+
+    return rows
 
 
 def means(rows: list[dict[str, Any]], by: tuple[str, ...]) -> list[dict[str, Any]]:
     """Return the mean and the standard deviation over seeds of all figures, for each value of `by`."""
-    found = []
+    table = []
     for key, group in grouped(rows, by).items():
         names = [name for name in group[0] if name not in (*by, "seed")]
         values = np.array([[row[name] for name in names] for row in group])
-        told = (f"{mean:.2f} ± {off:.2f}" for mean, off in zip(values.mean(0), values.std(0), strict=True))
-        found.append(dict(zip(by, key, strict=True)) | dict(zip(names, told, strict=True)))
-    return found
+        cells = (f"{mean:.2f} ± {off:.2f}" for mean, off in zip(values.mean(0), values.std(0), strict=True))
+        table.append(dict(zip(by, key, strict=True)) | dict(zip(names, cells, strict=True)))
+    return table

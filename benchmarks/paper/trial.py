@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.paper.trials import Trial
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import LoopRun, follow, trace
+from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.sensing.pose import frame_from_pose
 
@@ -26,6 +28,7 @@ PLACE_M = 0.04  # finger tips to the middle of a container
 PADDING_KG_PER_M = APPLE_KG / 0.01  # weight that a container's floor carries: an apple sinks in 10 mm
 PACE_S = 1.0  # from a position to the next, where the arm does not stop
 CALM_N = 1.0  # contact force that counts as none
+WAY = ("way_mm", "way_95_mm", "way_max_mm", "lag_s", "way_without_lag_mm")  # figures of `accuracy.along`
 # Masses in the containers when a task begins: the one picked first, then the one picked second.
 OBJECTS_KG = {"as shown": (BALL_KG, APPLE_KG), "exchanged": (APPLE_KG, BALL_KG)}
 
@@ -44,6 +47,7 @@ class TrialOutcome(NamedTuple):
     events: np.ndarray  # (faults,) how often the loop reported each of `Fault`
     time_s: np.ndarray  # (t,)
     wall_n: np.ndarray  # (t,) contact force of the walls, the largest within each tick
+    way: np.ndarray  # (len(WAY),) distances from a goal that moves, NaN where goals stand still
 
     @property
     def operation(self) -> np.ndarray:
@@ -135,22 +139,21 @@ def below_tips(tip_m: np.ndarray, rotation: np.ndarray, gripper_m: float) -> np.
 
 
 def operate(
-    twin: Any,
-    controller: Controller,
-    goals: np.ndarray,
-    names: Sequence[str],
-    objects: str = "",
-    moves: bool = False,
-) -> TrialOutcome:
-    """Follow goals (p, 6) [mm, deg], picking and placing as their names say; raises as `measure`.
+    twin: Any, controller: Controller, goals: np.ndarray, names: Sequence[str], trial: Trial
+) -> tuple[TrialOutcome, Log]:
+    """Follow goals (p, 6) [mm, deg], picking and placing as their names say; return outcome and log.
 
-    If `moves`, the arm passes goals named "to ..." without a stop, and the outcome leaves them out.
+    On a lap in time only the first and the last goal are stops; in motion, all but those named "to ...". The
+    outcome has the stops alone.
+
+    Raises:
+        InputError: no tick was logged.
     """
     # Watch the twin's contact forces and its gripper.
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces_n: list[float] = []
     force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
-    gripper = Gripper(twin, names, finger_tips(goals, gripper_m), objects, gripper_m)
+    gripper = Gripper(twin, names, finger_tips(goals, gripper_m), trial.objects, gripper_m)
 
     def driven() -> None:
         """Note the wall's force of a control period, and let a floor carry what is held."""
@@ -159,25 +162,27 @@ def operate(
 
     watched: Any = WatchedTwin(twin, driven)
     # Run the loop, with or without stops.
-    stopped = ~(moves & np.char.startswith(names, "to "))
-    stopped[[0, -1]] = True
-    stops = np.flatnonzero(stopped)
-    if moves:
-        run = trace(watched, controller, goals, PACE_S, stopped, arrived=gripper.arrived)
-        at = (a._replace(index=int(np.searchsorted(stops, a.index))) for a in run.arrivals)
-        run = run._replace(arrivals=tuple(at))
+    passed = np.char.startswith(names, "to ") & trial.moves | bool(trial.lap_s)
+    passed[[0, -1]] = False
+    stops = np.flatnonzero(~passed)
+    if trial.moves or trial.lap_s:
+        pace_s = trial.lap_s / (len(goals) - 1) if trial.lap_s else PACE_S
+        run = trace(watched, controller, goals, pace_s, ~passed, arrived=gripper.arrived)
+        arrivals = (a._replace(index=int(np.searchsorted(stops, a.index))) for a in run.arrivals)
+        run = run._replace(arrivals=tuple(arrivals))
     else:
         run = follow(watched, controller, goals, arrived=gripper.arrived)
-    # Measure the run, and add the objects and the forces of each tick.
+    # Measure the run.
     outcome = measure(run, controller, goals[stops])
+    if trial.lap_s and run.ways:
+        along = accuracy.along(accuracy.ways_of(run), controller.dt_s)
+        outcome = outcome._replace(way=np.array([along[name] for name in WAY]))
+    # Add the objects and the forces of each tick.
     wall_n = np.zeros(len(run.log), np.float32)
     n = min(len(forces_n), len(wall_n))  # a lost arm takes no more pressures; venting is not logged
     wall_n[:n] = forces_n[:n]
-    return outcome._replace(
-        name=np.array(names)[stops],
-        success=gripper.success[stops],
-        wall_n=wall_n,
-    )
+    success = gripper.success[stops]
+    return outcome._replace(name=np.array(names)[stops], success=success, wall_n=wall_n), run.log
 
 
 def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> TrialOutcome:
@@ -198,6 +203,7 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> TrialOut
         events=np.array([counts.get(fault, 0) for fault in Fault]),
         time_s=log.time_s,
         wall_n=np.zeros(len(log), np.float32),
+        way=np.full(len(WAY), np.nan),
     )
 
 
@@ -206,6 +212,7 @@ def figures(outcome: TrialOutcome) -> dict[str, Any]:
     errors = accuracy.Accuracy(*(getattr(outcome, name) for name in accuracy.Accuracy._fields))
     return {
         **accuracy.figures(errors, dict(zip(Fault, outcome.events, strict=True))),
+        **dict(zip(WAY, outcome.way.tolist(), strict=True)),
         "operations": int(outcome.operation.sum()),
         "done": int(outcome.success.sum()),
         "calm_percent": 100 * float(np.mean(outcome.wall_n < CALM_N)),

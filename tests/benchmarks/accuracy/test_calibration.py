@@ -1,12 +1,12 @@
-"""Readers of public logs: their columns and units, and what detectors and fits find in the real ones."""
+"""Readers of public logs, what detectors and fits find in the real ones; the planted arm."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.calibration import logs
-from benchmarks.calibration.logs import read_asu, read_trunk
+from benchmarks.accuracy import calibration as logs
+from benchmarks.accuracy.calibration import planted_arm, read_asu, read_trunk
 from mjx_softarm.logs import checks
 from mjx_softarm.logs.checks import LogError
 
@@ -76,69 +76,24 @@ def test_real_draw_wires(name, wire_mm):
     assert logs.wires(DATA, name)["fresh rows at rest"] <= wire_mm
 
 
-def asu_table(n=60):
-    """Column k of pressures and wires is about k; the bodies hang one below the other."""
-    rng = np.random.default_rng(0)
-    table = np.zeros((n, 38))
-    table[:, 0] = 0.01 * np.arange(n)
-    table[:, 1:17] = np.arange(1, 17) + 0.01 * rng.standard_normal((n, 16))
-    for body in range(3):
-        table[:, 17 + 7 * body : 20 + 7 * body] = -0.1 * body + 0.001 * rng.standard_normal((n, 3))
-        table[:, 20 + 7 * body : 24 + 7 * body] = [0.0, 0.6, 0.0, 0.8]
-    return table
-
-
-def save(path, table, names=()):
-    np.savetxt(path, table, "%.9g", ",", header=",".join(names), comments="")
-    return path
-
-
-def test_asu_columns_and_stale_rows(tmp_path):
-    table = asu_table()
-    table[[5, 50], 17:] = table[[4, 49], 17:]
-    np.savetxt(path := tmp_path / "asu.txt", table, "%.9g", ", ")
-    log = read_asu(path)
-    assert np.flatnonzero(~log.fresh).tolist() == [5, 50]
-    np.testing.assert_allclose(log.pressure_kpa.mean(axis=0) / PSI, [4, 5, 6, 10, 11, 12], atol=0.01)
-    np.testing.assert_allclose(log.wire_m.mean(axis=0), np.arange(13, 17) / 5.0, atol=0.01)
-    np.testing.assert_allclose(log.position_m.mean(axis=0), [[0.0] * 3, [-0.1] * 3, [-0.2] * 3], atol=0.001)
-    np.testing.assert_array_equal(log.quaternion[0], [[0.8, 0.0, 0.6, 0.0]] * 3)
-    np.testing.assert_allclose(log.section_m, 0.1 * np.sqrt(3.0), atol=0.01)
-
-
-def trunk_columns(n=60):
-    rng = np.random.default_rng(0)
-    columns = {"ID": np.arange(n)}
-    for disk in (1, 2, 3):
-        columns |= {f"{axis}{disk}": disk + 0.01 * rng.standard_normal(n) for axis in "xyz"}
-        columns |= {
-            f"{part}{disk}": np.full(n, q)
-            for part, q in zip(("qx", "qy", "qz", "w"), (0, 0.6, 0, 0.8), strict=True)
-        }
-    return columns | {f"phi{k}": 10.0 * k + rng.standard_normal(n) for k in range(1, 7)}
-
-
-def test_trunk_columns_and_stale_rows(tmp_path):
-    columns = trunk_columns()
-    for name in ("x3", "y3", "z3"):
-        columns[name][10] = columns[name][9]
-    log = read_trunk(save(tmp_path / "trunk.csv", np.stack(list(columns.values()), axis=1), columns))
-    assert np.flatnonzero(~log.fresh).tolist() == [10]
-    np.testing.assert_array_equal(log.quaternion[0], [[0.8, 0.0, 0.6, 0.0]] * 3)
-    np.testing.assert_allclose(log.motor_deg.mean(axis=0), 10.0 * np.arange(1, 7), atol=0.5)
-    np.testing.assert_allclose(log.position_m.mean(axis=0), np.outer([1, 2, 3], np.ones(3)), atol=0.01)
-
-
 def test_files_that_are_not_such_logs(tmp_path):
-    columns = {name: x for name, x in trunk_columns().items() if name not in ("y2", "w3")}
-    trunk = save(tmp_path / "trunk.csv", np.stack(list(columns.values()), axis=1), columns)
-    with pytest.raises(LogError, match="trunk.csv: line 1: y2, w3: got no such columns, expected"):
+    names = [f"{axis}{disk}" for disk in (1, 2, 3) for axis in "xyz"] + [f"phi{k}" for k in range(1, 7)]
+    trunk, asu = tmp_path / "trunk.csv", tmp_path / "asu.txt"
+    np.savetxt(trunk, np.ones((4, 14)), "%g", ",", header=",".join(names[:4] + names[5:]), comments="")
+    with pytest.raises(LogError, match="trunk.csv: line 1: y2: got no such columns, expected"):
         read_trunk(trunk)
-    with pytest.raises(LogError, match="trunk.csv: line 1: got 26 cells, expected 38"):
-        read_asu(trunk)
-    table = asu_table()
+    table = np.ones((9, 38))
     table[7, 4] = np.nan
+    np.savetxt(asu, table, "%g", ",")
     with pytest.raises(LogError, match="asu.txt: line 8: measured0: got nan, expected a finite number"):
-        read_asu(save(tmp_path / "asu.txt", table))
-    with pytest.raises(LogError, match="no.txt: got .No such file"):
-        read_asu(tmp_path / "no.txt")
+        read_asu(asu)
+    np.savetxt(asu, table[:, :26], "%g", ",")
+    with pytest.raises(LogError, match="asu.txt: line 1: got 26 cells, expected 38"):
+        read_asu(asu)
+
+
+@pytest.mark.slow
+def test_numbers_of_a_planted_arm_are_identified():
+    errors = planted_arm()
+    assert errors["beta, largest error [%]"] < 0.5 and errors["stiffness, largest error [%]"] < 5.0
+    assert 3.0 * errors["tip at held-out poses, calibrated"] < errors["tip at held-out poses, before"]

@@ -1,5 +1,6 @@
 """Arms whose actions are pressures, and what the comparison of claims makes of results."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -7,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.accuracy.claims import KINDS, N_SOLVED, Descent, PressureEnv, follow, means
+from benchmarks.paper import independence
+from benchmarks.paper.independence import POLICIES, SOLVER, PressureEnv, follow, means
+from benchmarks.paper.trials import SMOKE
 from mjx_softarm._support import xla
-from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp import rewards
 from tests.train.small import SHORT
 from train.agent.analytic import Analytic
@@ -51,7 +54,7 @@ def test_an_action_is_a_pressure_whatever_the_payload(arms):
 
 
 def test_pressures_cost_the_error_of_the_pose_alone(arms):
-    config = override(PRESETS["analytic"], KINDS["pressures"].settings)
+    config = override(PRESETS["analytic"], POLICIES["pressures"].settings)
     action = jnp.array([-0.9, 0.0, 0.5])
     after = jax.tree.map(lambda x: x[0], arms.step(arms.start, jnp.stack([action, action]))[0])
     arm, reward = after.pipeline_state, arms.env.config.reward
@@ -82,30 +85,18 @@ def test_a_payload_is_carried_and_observed_from_the_first_action_on(quick_compil
     assert not np.allclose(light.pose, heavy.pose, atol=1.0)
 
 
-def test_gradient_descent_goes_to_goals_of_both_sets(monkeypatch):
-    descent, asked = Descent(ReachEnv(config=EnvConfig(n_poses=16)), 4), []
-    assert [len(poses) for poses in descent.sets] == [4, 4]
-    sets = [np.arange(first, first + 6.0 * (N_SOLVED + 10)).reshape(-1, 6) for first in (0.0, 1000.0)]
-
-    def along(path, key):
-        asked.append(path)
-        return np.stack([np.full(len(path), 4.0), np.arange(len(path)) % 2])
-
-    with monkeypatch.context() as patch:
-        patch.setattr(descent, "along", along)
-        patch.setattr(descent, "sets", sets)
-        found = [descent.run(seed) for seed in (0, 1)]
-    for some, of_all in zip((asked[0][:N_SOLVED], asked[0][N_SOLVED:]), sets, strict=True):
-        assert len(np.unique(some, axis=0)) == N_SOLVED
-        assert (some[:, None] == of_all).all(axis=-1).any(axis=1).all()
-    assert found[0] == {"median_mm": 4.0, "mean_mm": 4.0, "p95_mm": 4.0, "saturated_percent": 50.0}
-    assert not np.array_equal(*asked)
-    # The arm stays at a goal where it is.
-    start = descent.reset(jax.random.key(0)).pipeline_state.pose
-    [[off_mm], [n_saturated]] = descent.along(np.asarray(start)[None], jax.random.key(0))
-    assert off_mm < 3.0 and n_saturated == 0.0  # the estimator is some 1.5 mm off
+def test_a_seed_that_is_measured_is_not_measured_again(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        independence,
+        "descent",
+        lambda settings: lambda seed: asked.append(seed) or [{"load_g": 0, "mm": 1.0}],
+    )
+    for seeds in ((0,), (0, 1)):
+        independence.measure(tmp_path, dataclasses.replace(SMOKE, seeds=seeds), SOLVER)
+    assert asked == [0, 1]
 
 
-def test_figures_are_told_over_the_seeds_of_a_group():
+def test_figures_are_means_over_the_seeds_of_a_group():
     rows = [{"way": w, "seed": s, "mm": mm} for w, s, mm in (("a", 0, 1.0), ("b", 0, 5.0), ("a", 1, 2.0))]
     assert means(rows, ("way",)) == [{"way": "a", "mm": "1.50 ± 0.50"}, {"way": "b", "mm": "5.00 ± 0.00"}]

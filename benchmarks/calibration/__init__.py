@@ -1,1 +1,0 @@
-"""Accuracy of calibrations, and of payloads that are told with them."""
