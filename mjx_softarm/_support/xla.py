@@ -90,52 +90,36 @@ def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:
     return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
 
 
-def in_chunks(function: Callable, n: int, n_chunks: int, batched: Any, arguments: tuple) -> Any:
-    """Return the results of a traced function for n rows, chunk after chunk; the last repeats its last row.
-
-    Args:
-        function: maps one row of the arguments to a tree of arrays; `jax.vmap` takes it over a chunk.
-        n: number of rows.
-        n_chunks: number of chunks.
-        batched: tree like the arguments, true for arrays that have the rows as first axis.
-        arguments: trees of arrays.
-    """
-    row = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
-    axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
-
-    def chunk(row: jax.Array) -> Any:
-        theirs = jax.tree.map(lambda x, own: jnp.asarray(x)[row] if own else x, arguments, tuple(batched))
-        return jax.vmap(function, in_axes=axes)(*theirs)
-
-    found = jax.lax.map(chunk, row)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
-
-
 def rows_last(function: Callable, n_at_once: int | None = None, n_shared: int = 0) -> Callable:
     """Return a function of one row; `jax.vmap` of it calls `function` with the rows as last axis.
 
     Args:
         function: maps trees of arrays (..., *rows) to another; *rows may be empty.
-        n_at_once: rows of a chunk; None for all of them.
+        n_at_once: rows of a chunk, one after another, the last filled up; None for all rows at once.
         n_shared: number of last arguments whose arrays have a last axis of 1 where all rows share them.
     """
     one = jax.custom_batching.custom_vmap(function)
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
-        def last(x: Any, own: bool, shape: tuple[int, ...]) -> jax.Array:
-            x = jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
-            return jnp.broadcast_to(x, (*x.shape[:-1], *shape)) if shape else x
+        n_chunks = -(-n // (n_at_once or n))
+        size = -(-n // n_chunks)
 
-        if n_at_once and n_at_once < n:
-            found = in_chunks(one, n, -(-n // n_at_once), batched, arguments)
+        def chunk(row: Any) -> Any:
+            def last(k: int, x: Any, is_batched: bool) -> jax.Array:
+                x = jnp.moveaxis(x[row], 0, -1) if is_batched else jnp.asarray(x)[..., None]
+                return jnp.broadcast_to(x, (*x.shape[:-1], size)) if k < len(arguments) - n_shared else x
+
+            pairs = enumerate(zip(arguments, batched, strict=True))
+            rows = [jax.tree.map(functools.partial(last, k), *pair) for k, pair in pairs]
+            return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), function(*rows))
+
+        if n_chunks == 1:
+            results = chunk(slice(None))
         else:
-            n_own = len(arguments) - n_shared
-            rows = [
-                jax.tree.map(functools.partial(last, shape=(n,) if k < n_own else ()), *pair)
-                for k, pair in enumerate(zip(arguments, batched, strict=True))
-            ]
-            found = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), function(*rows))
-        return found, jax.tree.map(lambda _: True, found)
+            row = jnp.minimum(jnp.arange(n_chunks * size), n - 1).reshape(n_chunks, size)
+            results = jax.lax.map(chunk, row)
+            results = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], results)
+        return results, jax.tree.map(lambda _: True, results)
 
     one.def_vmap(many)
     return one

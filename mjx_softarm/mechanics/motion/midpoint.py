@@ -138,7 +138,7 @@ def _run_back(
     Each control period is computed again, which takes less time than to store its numbers.
     """
     before, end_q, reference_m = kept
-    d_end, d_last, d_path = jax.lax.optimization_barrier(change)  # XLA would take minutes to fold zeros
+    d_end, d_last, d_path = jax.lax.optimization_barrier(change)  # XLA would fold zeros, for seconds
 
     def go_back(d_after: tuple[Motion, Array], at: tuple[Motion, Path]) -> tuple[tuple[Motion, Array], None]:
         motion, d_seen = at
