@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.calibration.logs import ASU_LOGS, read_asu, still_rows
+from benchmarks.accuracy.calibration import ASU_LOGS, read_asu, still_rows
 from scipy.optimize import least_squares
 
 from calib.fit import lines
