@@ -18,7 +18,7 @@ COMMANDS = {
     "imitate": "train.runs.command:Imitate",
     "evaluate": "train.runs.command:evaluate",
     "export": "train.runs.export:export",
-    "sweep": "train.sweep.command:SweepCommand",
+    "sweep": "train.sweep:Sweep",
     "demos record": "train.demos.command:Record",
     "demos check": "train.demos.command:Check",
 }

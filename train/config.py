@@ -9,15 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
-from train.agent.learner import LearnerConfig
+from train.agent.learner import ConfigError, LearnerConfig
 from train.agent.registry import LEARNERS, name_of
 from train.agent.tqc import TQCConfig
-
-
-class ConfigError(InputError):
-    """A setting that cannot be used; the message names it, what it got and what was expected."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +100,7 @@ def from_dict(data: dict[str, Any]) -> TrainConfig:
 
 def _read(kind: Any, value: Any, path: str) -> Any:
     """Return the value of a setting, or of a group of settings, whose type is `kind`, from what JSON gave."""
-    # A learner: its name tells the type of its config.
+    # A learner: the type of its config follows from its name.
     if kind is LearnerConfig and isinstance(value, dict):
         name, value = value.get("name"), {key: item for key, item in value.items() if key != "name"}
         if name not in LEARNERS:

@@ -59,8 +59,10 @@ class NewRunOptions(ArmOptions):
         names = _differing(self, new, ("resume", "devices", "config"))
         names += _differing(getattr(self, "config", None), getattr(new, "config", None))
         if names:
-            told = ", ".join(f"--{name}" for name in dict.fromkeys(names))
-            raise ConfigError(f"--resume {self.resume}: got {told} too, expected none: its own settings hold")
+            given = ", ".join(f"--{name}" for name in dict.fromkeys(names))
+            raise ConfigError(
+                f"--resume {self.resume}: got {given} too, expected none: its own settings hold"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +79,9 @@ class ReachOptions(NewRunOptions):
     def default(cls, arguments: Sequence[str]) -> Self:
         preset = named(arguments, "--preset", PRESETS, "quick")
         config = PRESETS[preset]
-        own = name_of(config.learner)
-        learner = named(arguments, "--learner", LEARNERS, own)
-        if learner != own:
+        preset_learner = name_of(config.learner)
+        learner = named(arguments, "--learner", LEARNERS, preset_learner)
+        if learner != preset_learner:
             config = dataclasses.replace(config, learner=LEARNERS[learner].config())
         return cls(preset=preset, learner=learner, config=config)
 

@@ -9,8 +9,7 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from train.agent.analytic import AnalyticConfig
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
-from train.agent.imitation import ImitationConfig
-from train.agent.stages import GoalStage
+from train.agent.imitation import GoalStage, ImitationConfig
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 
@@ -47,7 +46,7 @@ _ALWAYS = RewardConfig(
     goal_bonus=0.0, error_cost=0.0, step_cost=0.0, saturation_cost=10.0, distance_cost=200.0
 )
 
-# A policy of motion sees springs and pressures at once, whose relation differs on a real arm.
+# Motion policies observe springs and pressures; their relation differs on a real arm.
 _INEXACT = dataclasses.replace(_MOVING.randomisation, stiffness_spread=0.2)
 
 # Half-second actions of arms in motion. The discount sees the time that an arm takes to settle, and goals are

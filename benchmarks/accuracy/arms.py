@@ -86,7 +86,7 @@ def measure(
     steps: int | None = None,
     points: int = 40,
     loads: cli.Integers = (),
-    out: Path = Path("runs/arms"),
+    keep: Path = Path("runs/arms"),
 ) -> dict[str, Any]:
     """How well do arms of several kinds follow goals, from recording to measurement, by the same commands?
 
@@ -97,13 +97,13 @@ def measure(
         steps: environment steps of each training; None: the preset's
         points: goals of the circle, and of the grid at most
         loads: payloads with which the circle is followed, too [g]
-        out: working folder: the same command continues, and arms may be added
+        keep: working folder: the same command continues, and arms may be added
 
     Raises:
         JobError: a command failed, or the folder has other settings.
         PeerError: SoRoMoX could not be installed.
     """
-    settings, out = ArmSettings(poses, preset, steps, points, loads), out.absolute()
+    settings, out = ArmSettings(poses, preset, steps, points, loads), keep.absolute()
     claim(out, settings)
     run_stages(out, settings, [[WorkStage(arm, (f"{arm}/figures.json",), take, (arm,)) for arm in arms]])
     figures = {arm: json.loads((out / arm / "figures.json").read_text("utf-8")) for arm in arms}

@@ -35,7 +35,7 @@ from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
-from train.agent.registry import World, learner_of
+from train.agent.registry import epoch_of
 from train.config import override
 from train.presets import PRESETS
 from train.runs import evaluate
@@ -127,7 +127,7 @@ class PolicyTrial:
         self.paths = paths_of(jnp.concatenate(goals_of(env, self.n_goals)))
         self.keys = start_keys(len(self.paths))
         self._job = task_of(self.config, kind.env(spec, self.config.env)).job
-        one = functools.partial(follow, env, learner_of(self.config.learner, World(env)))
+        one = functools.partial(follow, env, epoch_of(self.config.learner, env).learner)
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
 
     def rows(self, seed: int) -> list[dict[str, Any]]:

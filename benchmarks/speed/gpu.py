@@ -19,7 +19,7 @@ from benchmarks.harness.rounds import Worker, take_turns
 from benchmarks.harness.stages import command
 from benchmarks.speed.throughput import figures_of
 from mjx_softarm._support import cli
-from train.sweep.run import open_sweep
+from train.sweep import open_members
 
 N_ROUNDS = 2
 FIGURES = ("median_mm", "p95_mm", "reached_share", "saturated_share", "circle_mean_mm")
@@ -110,7 +110,7 @@ def training(preset: str, sweep: Path) -> list[dict[str, Any]]:
     asked = ("train", "sweep", "--preset", preset, "--seeds", seeds, *words, "--out", sweep)
     command(sweep.with_suffix(".log"), *asked, makes=sweep / "results.json")
     rows = []
-    for run in open_sweep(sweep).runs:
+    for run in open_members(sweep):
         figures = json.loads((run.path / "evaluation.json").read_text("utf-8"))
         row = {"preset": preset, "seed": run.config.seed, **times_to(run.metrics())}
         rows.append(row | {name: figures[name] for name in FIGURES})

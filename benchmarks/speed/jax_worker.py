@@ -31,8 +31,10 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.gym import EPISODE_LENGTH
 from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.spec import ArmSpec
+from train.agent.registry import epoch_of
 from train.config import TrainConfig
 from train.epoch.devices import mesh_of, split
+from train.epoch.job import Job
 from train.presets import PRESETS
 from train.runs.task import task_of
 
@@ -123,12 +125,12 @@ def gradient_steps(preset: str) -> Program:
     """Compile the gradient steps of a preset that learns from a replay; networks and replay are zeros."""
     config = resized(preset, N_STARTS, updates_per_env_step=N_UPDATES / N_STARTS)
     env = dataclasses.replace(config.env, engine="chain", mode="quasistatic", n_poses=N_POSES)
-    job = task_of(dataclasses.replace(config, env=env), ReachEnv(config=env)).job
-    state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), job.shapes())
+    epoch: Any = epoch_of(config.learner, ReachEnv(config=env))
+    state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), Job(epoch).shapes())
     start, key = time.perf_counter(), jax.random.PRNGKey(0)
 
     def run(state: Any, key: jax.Array) -> Any:
-        return job.learn(state, key, jnp.asarray(True))[0].learner
+        return epoch.learn(state.learner, state.memory, key, jnp.asarray(True))[0]
 
     compiled = xla.jit(run, "networks").lower(state, key).compile()
     return Program(time.perf_counter() - start, lambda: compiled(state, key), 0, N_UPDATES)

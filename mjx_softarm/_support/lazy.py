@@ -35,11 +35,11 @@ class LazyModule:
 def _keep_bodies_apart() -> None:
     """Keep XLA from fusing MJX's computations of one body with those of the next.
 
-    MJX writes a chain of bodies out body by body, and XLA's fusions repeat what bodies share: on a CPU the
-    kinematics of a dozen links then compile for minutes, on their way into `jax.jit` by anybody. A barrier
-    after each body changes no number. With it MJX compiles in half of the time of the best options without.
+    MJX writes a chain out body by body, and XLA's fusions repeat what bodies share: a plain `jax.jit` of the
+    kinematics of a dozen links compiles for minutes on a CPU. A barrier after each body changes no number.
+    With it MJX compiles in half of the time that the best options of `xla` take without it.
     """
-    scan = importlib.import_module("mujoco.mjx._src.scan")
+    scan: Any = importlib.import_module("mujoco.mjx._src.scan")
     body_tree = scan.body_tree
 
     @functools.wraps(body_tree)

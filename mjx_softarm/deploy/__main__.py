@@ -28,6 +28,7 @@ from mjx_softarm.deploy.measure import (
     figures,
     measure,
     print_figures,
+    print_origin,
     print_run,
     read_goals,
     ways_of,
@@ -200,9 +201,10 @@ def _measure(
         pace_s = seconds / max(len(poses) - 1, 1)
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     finish(driver, tell)
+    print_run(run, controller.policy)
     if run.arrivals:
         _report_accuracy(run, controller, poses, out, payload_kg if seconds is None else None)
-    print_run(run, controller.policy)
+    print_origin(controller.policy, options.arm)
     return run.status
 
 
@@ -232,10 +234,10 @@ def _report_accuracy(
         print(missing)
     elif split is not None:
         draw(split, out / "budget.png")
+    print(f"figures: {out / 'accuracy.json'}")
     print_figures(numbers)
     if split is not None:
         print("\n".join(split.lines()))
-    print(f"figures: {out / 'accuracy.json'}")
 
 
 def _record(

@@ -338,9 +338,21 @@ def print_figures(numbers: dict[str, Any]) -> None:
         print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
     if "way_s" in numbers:
         print(
-            f"on the way, {numbers['way_s']:.0f} s [mm]: mean {numbers['way_mm']:.2f}, 95 % below "
+            f"on the path, {numbers['way_s']:.0f} s [mm]: mean {numbers['way_mm']:.2f}, 95 % below "
             f"{numbers['way_95_mm']:.2f}, at most {numbers['way_max_mm']:.2f}; "
             f"{numbers['lag_s']:.2f} s behind, without that {numbers['way_without_lag_mm']:.2f}"
         )
-    measured = f"{numbers['measured']} of {numbers['points']} goals measured"
-    print(f"{measured}, {numbers['saturated_points']} with a saturated chamber")
+        passed = numbers["points"] - numbers["measured"]
+        measured = f"{numbers['measured']} stops measured, {passed} goals passed on the path"
+    else:
+        measured = f"{numbers['measured']} of {numbers['points']} goals measured"
+    print(f"{measured}; saturated chambers at {numbers['saturated_points'] or 'none'} of them")
+
+
+def print_origin(policy: Policy, arm: str) -> None:
+    """Print what was trained in which simulation, and the arm that it ran on."""
+    config = policy.provenance.get("train", {})
+    env, learner = config.get("env", {}), config.get("learner", {})
+    motion = "in motion" if env.get("mode") == "dynamic" else "at rest"
+    trained = f"learned by {learner['name']} in engine {env['engine']}, {motion}" if learner else "no record"
+    print(f"policy: preset {policy.provenance.get('preset') or 'unknown'}, {trained}; arm: {arm}")

@@ -163,9 +163,9 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
         "covariance_kpa2": (s, c, c),
         "hysteresis_kpa": (s,),
         "stroke_m": (s,),
+        "factor": (),
+        "factor_sd": (),
     }
-    if f"{KIND}.factor" in entries:  # older calibrations have none
-        shapes |= {"factor": (), "factor_sd": ()}
     # Take them, and check what shapes do not show
     arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
     held = HeldPressures(**arrays)

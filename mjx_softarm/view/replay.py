@@ -23,6 +23,7 @@ from mjx_softarm.view.stage import Stage, open_server, set_the_scene
 APART_M = 0.6  # distance between the bases of arms side by side
 FRAME_S, TRACES_S = 0.04, 0.2  # time between frames, and between points of the traces
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "10", "30")
+PATH_POINTS = 400  # points of the path that is asked for, about
 SHARE_HZ, SHARE_FRAMES = 10.0, 600  # frame rate; largest number of frames, so a longer log plays faster
 
 
@@ -42,6 +43,8 @@ class Timeline:
             raise InputError(f"{path}: got no rows, expected some")
         self.name, self._time_s = path.name, log.time_s - log.time_s[0]
         self._look, self.end_s = looks(log, spec), float(self._time_s[-1])
+        goal = np.zeros((0, 6)) if log.goal is None else log.goal[np.isfinite(log.goal).all(axis=1)]
+        self.path_m = 1e-3 * goal[:: max(1, len(goal) // PATH_POINTS), :3]  # (k, 3) goals in their order
 
     def at(self, time_s: float) -> Look:
         """Return the last look before a time."""
@@ -118,5 +121,6 @@ def _stages(server: viser.ViserServer, spec: ArmSpec, timelines: Sequence[Timeli
     stages = []
     for k, timeline in enumerate(timelines):
         stages.append(Stage(server.scene, spec, Limits.of(spec), f"/arm{k}", (0.0, k * APART_M, 0.0)))
+        stages[-1].show_path(timeline.path_m)
         server.scene.add_label(f"/arm{k}/name", timeline.name, position=(0.0, 0.0, 0.09))
     return stages

@@ -96,6 +96,7 @@ class Stage:
             f"{name}/tip/payload", 1.0, color=_PAYLOAD, position=(0.0, 0.0, -spec.mass.gripper_length_m)
         )
         self._markers, self._path = points("markers", SEEN, 0.008), points("trail", _TRAIL, 0.003)
+        self._asked = points("path", GOAL, 0.004)
 
     def show(self, look: Look) -> None:
         """Draw a moment."""
@@ -115,6 +116,11 @@ class Stage:
         if len(look.marker_m) and np.isfinite(look.marker_m).all():
             self._markers.points, self._markers.visible = look.marker_m, True
         self._follow(now.rings.position_m[-1])
+
+    def show_path(self, position_m: np.ndarray) -> None:
+        """Draw the path (k, 3) [m] that is asked for; nothing where it has no points."""
+        if len(position_m):
+            self._asked.points, self._asked.visible = position_m, True
 
     def _follow(self, tip_m: np.ndarray) -> None:
         if not self._trail or np.linalg.norm(tip_m - self._trail[-1]) > _TRAIL_STEP_M:

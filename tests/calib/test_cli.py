@@ -27,7 +27,7 @@ def demo(tmp_path_factory):
     """Logs of the planted arm of seed 0, fewer than the command writes."""
     folder = tmp_path_factory.mktemp("demo") / "logs"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calib.demo, "N_POSES", 300)
+        patch.setattr(calib.demo, "N_POSES", 200)
         patch.setattr(calib.demo, "N_STEPS", 3)
         files = write_demo(folder, ArmSpec.default(), seed=0)
     return [str(file) for file in files]
@@ -37,16 +37,11 @@ def demo(tmp_path_factory):
 def calibrated(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("calib.fit.s2r.N_POINTS", 6_000)
+        patch.setattr("calib.fit.s2r.N_POINTS", 3_000)
         schedule = network.OF_PROCESS.schedule._replace(n_updates=2_000)
         patch.setattr(network, "OF_PROCESS", dataclasses.replace(network.OF_PROCESS, schedule=schedule))
         status = main(["run", *demo, "--out", str(folder)])
     return status, folder
-
-
-def test_demo_logs_have_no_fault(demo, capsys):
-    assert main(["check", *demo]) == 0
-    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == demo
 
 
 def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
@@ -145,17 +140,6 @@ def test_a_known_weight_tells_how_payloads_are_felt(demo, calibrated, tmp_path, 
         assert "next: nothing to export" in said.out
 
 
-def test_a_later_log_that_shows_no_change_names_no_export(demo, calibrated, tmp_path, capsys):
-    """Five poses are too few to tell a change."""
-    log, later = read_log(demo[1])[0], tmp_path / "later.npz"
-    write_log(later, log.take(np.arange(5)))
-    out = tmp_path / "new"
-    assert main(["run", str(later), "--since", str(calibrated[1]), "--out", str(out)]) == 1
-    said = capsys.readouterr().out
-    assert "next: nothing to export" in said and "train export" not in said
-    assert (out / "arm.toml").read_bytes() == (calibrated[1] / "arm.toml").read_bytes()
-
-
 @pytest.mark.parametrize("option", ["--spec", "--shared-springs", "--fit-compensation", "--s2r"])
 def test_options_that_a_later_log_does_not_have_are_refused(option, tmp_path, capsys):
     value = {"--spec": ["paper"], "--s2r": ["printed"]}.get(option, [])
@@ -209,12 +193,6 @@ def test_training_takes_the_folder(calibrated, trained_env, tmp_path):
     np.testing.assert_array_equal(env.pool.spring_m, plain.pool.spring_m)
 
 
-def test_training_tells_that_a_folder_has_no_network(calibrated, trained_env, tmp_path, capsys):
-    shutil.copy(calibrated[1] / "arm.toml", tmp_path)
-    assert trained_env(tmp_path).s2r is None
-    assert f"no {tmp_path / 's2r.npz'}: training on simulated poses" in capsys.readouterr().out
-
-
 def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys):
     """Springs alone: the rest of the arm stays as specified, nothing is invented."""
     springs = tmp_path / "springs.csv"
@@ -227,17 +205,6 @@ def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys)
     assert not (tmp_path / "out" / "s2r.npz").exists()
     found = ArmSpec.from_toml(tmp_path / "out" / "arm.toml")
     assert found.chambers == ArmSpec.default().chambers
-
-
-def test_poses_that_were_not_held_are_said_not_to_be_at_rest(demo, tmp_path, capsys):
-    log, _ = read_log(demo[1])
-    path = tmp_path / "fast.csv"
-    write_log(path, dataclasses.replace(log, time_s=0.4 * log.time_s))  # a pose every 2 s
-    assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 1
-    page = (tmp_path / "out" / "report.html").read_text()
-    fate = f"Rows of the logs: {len(log)} pressures not held long enough."
-    assert "Got 0 poses at rest with pressures and tip poses, expected 20 or more; pressures must" in page
-    assert page.count(fate) == 2  # chambers and sim-to-real network
 
 
 def test_check_takes_the_arm_s_number_of_chambers(demo, tmp_path, capsys):
@@ -256,15 +223,6 @@ def test_circuit_and_shared_springs(demo, tmp_path):
     sensor, default = ArmSpec.from_toml(out / "arm.toml").sensor, ArmSpec.default().sensor
     assert len(set(sensor.beta)) == len(set(sensor.delta_m)) == 1
     assert sensor.compensation_h != default.compensation_h
-
-
-def test_template_is_a_log(tmp_path, capsys):
-    path = tmp_path / "log.csv"
-    assert main(["template", str(path)]) == 0
-    assert "pressure" in capsys.readouterr().out
-    assert main(["check", str(path)]) == 0
-    assert main(["template", str(path)]) == 2
-    assert str(path) in capsys.readouterr().err
 
 
 def test_bad_and_missing_files_and_other_arms_are_refused_in_a_line_and_nothing_is_left(

@@ -1,6 +1,5 @@
 """Arms by name, and the command line that drives them, without JAX in its process."""
 
-import json
 import re
 import subprocess
 import sys
@@ -15,10 +14,11 @@ from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.drivers.names import open_arm, twin_spec
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.spec import ArmSpec
-from tests.linear_arm import FAR, POLICY, REST_M, SENSOR, LinearArm, N
+from tests.linear_arm import FAR, GOALS, POLICY, REST_M, SENSOR, LinearArm, N
 
 ROOT = Path(__file__).resolve().parents[2]
 FAR_AWAY = "--goal=" + ",".join(map(str, FAR))
+MISSED = "--goal=" + ",".join(map(str, GOALS[0]))
 
 
 @pytest.mark.parametrize(
@@ -95,43 +95,13 @@ def test_command_line_runs_without_jax(folder):
     done = command(
         folder, "run", "policy.npz", "--arm", "driver:Arm", goal, "--log", "a.csv", "--duration", "1"
     )
-    assert done.stderr == "" and done.stdout.endswith("1 []\n") and "0 of 1 goals reached" in done.stdout
-    assert "from readings to pressures: median" in done.stdout and "the arm is vented" in done.stdout
+    assert done.stderr == "" and done.stdout.endswith("1 []\n")
+    assert "from readings to pressures: median" in done.stdout
+    assert "0 of 1 goals reached; the arm is vented" in done.stdout
     assert len(read_log(folder / "a.csv")[0]) > 0
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "2")
     assert done.stderr == "" and done.stdout.endswith("0 []\n") and "no motion capture" in done.stdout
     assert (folder / "b.csv").read_text().count("\n") == 3
-
-
-def test_accuracy_is_measured_without_jax(folder):
-    """The arm never leaves its place: the tip is where the springs say, and the policy where it asks."""
-    seen = """
-    def motion_capture(self):
-        from mjx_softarm.deploy.arm_io import Capture
-        return Capture(np.array([0.0, 0.0, -0.5]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
-"""
-    measure = ("measure", "policy.npz", "--arm", "driver:Arm", "--out", "a", "--goals", "goals.csv")
-    goal = POLICY.workspace[0]
-    header = "x [mm],y [mm],z [mm],yaw [deg],pitch [deg],roll [deg]"
-    (folder / "goals.csv").write_text(f"{header}\n{','.join(map(str, goal))}\n")
-    with (folder / "driver.py").open("a") as file:
-        file.write(seen)
-    done = command(folder, *measure)
-    assert done.stderr == "" and done.stdout.endswith("1 []\n") and "NOT REACHED" in done.stdout
-    found = json.loads((folder / "a" / "accuracy.json").read_text())
-    assert (found["points"], found["measured"], found["reached"]) == (1, 1, 0)
-    times = float(re.search(r"NOT REACHED, (\S+) times the error that a goal allows", done.stdout)[1])
-    assert times > 1.0
-    for line in (
-        "1 of 1 goals measured",
-        "0 of 1 goals reached",
-        "reached within 5.4 mm if the rotation is exact",
-        "the policy is not calibrated: it is expected to miss",
-    ):
-        assert line in done.stdout
-    off_mm = np.linalg.norm(goal[:3] - [0.0, 0.0, -500.0])
-    assert found["translation_mm"] == found["max_mm"] == pytest.approx(off_mm)
-    assert found["saturated_points"] == 1 and len(read_log(folder / "a" / "log.npz")[0]) > 100
 
 
 @pytest.mark.parametrize(
@@ -211,6 +181,9 @@ def test_a_twin_names_its_own_arm(name, spec):
         ),
         (f"run policy.npz --arm its:Arm {FAR_AWAY}", 1, "goal outside the workspace"),
         (f"run --arm its:Arm {FAR_AWAY}", 1, "policy: the package's own"),
+        (f"run policy.npz --arm its:Arm {MISSED}", 1, " NOT REACHED, "),
+        (f"run policy.npz --arm its:Arm {MISSED}", 1, "reached within 5.4 mm if the rotation is exact"),
+        (f"run policy.npz --arm its:Arm {MISSED}", 1, "the policy is not calibrated: it is expected to miss"),
     ],
 )
 def test_lines_of_commands(words, status, line, tmp_path, monkeypatch, capsys):

@@ -12,7 +12,6 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.ending import DONE, MISSED
 from mjx_softarm.deploy.link import first_frame
 from mjx_softarm.deploy.measure import (
-    Accuracy,
     along,
     figures,
     grid_poses,
@@ -181,23 +180,7 @@ def test_grid_is_spread_over_the_workspace():
     assert len(grid_poses(cloud, 1)) == 1
 
 
-def test_a_picture_of_a_path_in_time_shows_the_way(tmp_path, monkeypatch):
-    figure = pytest.importorskip("matplotlib.figure")
-    drawn = []
-    monkeypatch.setattr(figure.Figure, "savefig", lambda self, *at, **how: drawn.append(self))
-    goals = np.zeros((3, 6))
-    nothing = np.full(3, np.nan)
-    found = Accuracy(goals, goals + np.nan, goals, np.zeros((3, N), bool), nothing, nothing)
-    goal = np.linspace(0.0, 90.0, 10)[:, None] * [1.0, 0.0, 0.0]
-    tip = goal + [0.0, 4.0, 0.0]
-    tip[3] = np.nan  # not seen
-    assert write_accuracy(tmp_path, found, {}, [(tip, goal)]) == ""
-    above, _, shares = drawn[0].axes
-    np.testing.assert_array_equal(above.lines[1].get_ydata(), tip[:, 1])
-    assert list(shares.lines[0].get_xdata()) == [4.0] * 9 and "time" in shares.get_ylabel()
-
-
-def test_distance_and_lag_along_a_way():
+def test_distance_and_lag_along_a_way(tmp_path):
     """A tip that does in each tick what the goal did 0.4 s before, 3 mm beside it; one frame is lost."""
     n, lag = 500, 20
     goal = np.tile([0.0, 0.0, -600.0, 0.0, 0.0, 0.0], (n + lag, 1))
@@ -205,6 +188,10 @@ def test_distance_and_lag_along_a_way():
     tip_mm = goal[:n, :3] + [0.0, 3.0, 0.0]
     tip_mm[7] = np.nan
     run = SimpleNamespace(log=SimpleNamespace(goal=goal[lag:], tip_m=1e-3 * tip_mm), ways=(slice(0, n),))
-    found = along(ways_of(run), 0.02)
-    assert found["lag_s"] == pytest.approx(0.4) and found["way_without_lag_mm"] == pytest.approx(3.0)
-    assert found["way_mm"] == pytest.approx(np.hypot(lag, 3.0)) and found["way_s"] == pytest.approx(10.0)
+    numbers = along(ways_of(run), 0.02)
+    assert numbers["lag_s"] == pytest.approx(0.4) and numbers["way_without_lag_mm"] == pytest.approx(3.0)
+    assert numbers["way_mm"] == pytest.approx(np.hypot(lag, 3.0)) and numbers["way_s"] == pytest.approx(10.0)
+    pytest.importorskip("matplotlib")
+    measured = measure(go(Seen(), goals=GOALS[:1]), CONTROLLER, GOALS[:1])
+    assert write_accuracy(tmp_path, measured, numbers, ways_of(run)) == ""
+    assert (tmp_path / "accuracy.png").stat().st_size > 0

@@ -24,20 +24,25 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert "equilibrium" in (tmp_path / "api/index.html").read_text("utf-8")  # docstrings are read
 
 
+def prose(page):
+    """Return a page without its blocks of code."""
+    return re.sub(r"```.+?```", "", page.read_text("utf-8"), flags=re.S)
+
+
 def anchors(page):
     """Return the anchors of a page's headings, as mkdocs and GitHub make them."""
-    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.+?```", "", page.read_text("utf-8"), flags=re.S), re.M)
+    headings = re.findall(r"^#+ (.+)$", prose(page), re.M)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def links(page):
     """Return what a page links to, other sites left out."""
-    pairs = re.findall(r"\]\(([^)]+)|src=\"([^\"]+)", page.read_text("utf-8"))
+    pairs = re.findall(r"\]\(([^)]+)|src=\"([^\"]+)", prose(page))
     return [target for pair in pairs for target in pair if target and "://" not in target]
 
 
 def test_there_are_links():
-    assert len(links(ROOT / "README.md")) > 10 and sum(len(links(page)) for page in PAGES) > 200
+    assert len(links(ROOT / "README.md")) > 10 and sum(len(links(page)) for page in PAGES) > 150
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -56,7 +61,7 @@ def test_results_keep_no_path_of_a_machine(file):
 
 def test_the_list_of_files_has_each_result_with_its_command_and_commit():
     page = (ROOT / "docs/results.md").read_text("utf-8")
-    rows = re.findall(r"^- \[(\S+)\]\(results/\1\), (\w{7}): `([^`]+)`$", page, re.M)
+    rows = re.findall(r"^- \[(\S+)\]\(results/\1\), (\w{7}): `([^`]+)`(?:, now `[^`]+`)?$", page, re.M)
     assert sorted(name for name, *_ in rows) == sorted(f.name for f in (ROOT / "docs/results").glob("*.json"))
     for name, commit, beginning in rows:
         if not beginning.startswith("python -m "):

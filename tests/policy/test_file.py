@@ -20,6 +20,7 @@ from mjx_softarm.mdp.observation import OBS_LAYOUT, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
+from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
@@ -125,38 +126,22 @@ def test_file_is_plain_npz_with_named_layouts(file):
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
 
 
-def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model):
-    policy = policy_from_actor(
-        make_params((), 6), TWO_SECTIONS, RewardConfig(), make_arm_model(TWO_SECTIONS), {}
-    )
-    save_policy(tmp_path / "policy.npz", policy)
-    assert_same(load_policy(tmp_path / "policy.npz"), policy)
-
-
-def test_other_arms_are_kept(tmp_path, make_arm_model, other_arm):
-    """Actions, readings and lengths are per spring, pressures and the law per chamber."""
-    n_obs, path = len(layouts(other_arm)["motion"]), tmp_path / "policy.npz"
-    params, model = make_params((), other_arm.n_springs, n_obs), make_arm_model(other_arm, s2r=True)
-    policy = policy_from_actor(params, other_arm, RewardConfig(), model, {}, observation="motion")
+@pytest.mark.parametrize("observation", ["pose", "payload", "motion"])
+@pytest.mark.parametrize("spec", [TWO_SECTIONS, FOUR_CHAMBERS, SIX_CHAMBERS], ids=lambda spec: spec.name)
+def test_other_arms_and_observations_are_kept(tmp_path, make_arm_model, spec, observation):
+    """Actions and readings are per spring, pressures and the law per chamber; one layer is enough."""
+    names, path = layouts(spec)[observation], tmp_path / "policy.npz"
+    params, model = make_params((), spec.n_springs, len(names)), make_arm_model(spec, s2r=True)
+    policy = policy_from_actor(params, spec, RewardConfig(), model, {}, observation=observation)
     save_policy(path, policy)
     again = load_policy(path)
     assert_same(again, policy)
-    assert again.spec == other_arm and len(again.actions.low) == other_arm.n_springs
-    expected = allocation(other_arm)
+    assert again.spec == spec and len(again.actions.low) == spec.n_springs
+    assert tuple(arrays_of(path)["obs_layout"]) == again.obs_layout == names
+    expected = allocation(spec)
     assert (again.gains.allocation is None) == (expected is None)
     for one, other in zip(again.gains.allocation or (), expected or (), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("observation", ["payload", "motion"])
-def test_what_a_policy_observes_is_kept(tmp_path, make_arm_model, observation):
-    names = layouts(ArmSpec.default())[observation]
-    params, path = make_params(n_obs=len(names)), tmp_path / "policy.npz"
-    spec = ArmSpec.default()
-    model = make_arm_model(spec)
-    save_policy(path, policy_from_actor(params, spec, RewardConfig(), model, {}, observation=observation))
-    assert load_policy(path).observation == observation
-    assert tuple(arrays_of(path)["obs_layout"]) == load_policy(path).obs_layout == names
 
 
 @pytest.mark.parametrize("names", [["hidden_0"], ["hidden_1", "head"], ["hidden_0", "head", "norm_0"], []])

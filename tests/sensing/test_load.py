@@ -116,21 +116,11 @@ def test_numpy_and_jax_agree():
     np.testing.assert_allclose(estimate_load(estimator, *rows), in_jax, rtol=1e-4, atol=1e-5)
 
 
-def test_first_rest_replaces_what_was_assumed():
-    assert after(0.7) == Load(0.7, 1, half_width_kg=0.1)
-
-
 def test_rests_are_averaged():
     estimate_kg = 0.5 + 0.05 * np.random.default_rng(1).standard_normal(N_AVERAGED)
     assert after(*estimate_kg).kg == pytest.approx(estimate_kg.mean())
     late = after(*[0.5] * 100, 0.6)
     assert late.kg == pytest.approx(0.5 + 0.1 / N_AVERAGED) and late.n_estimates == N_AVERAGED
-
-
-def test_an_average_is_known_as_well_as_its_estimates_are_in_the_mean():
-    load = averaged(averaged(Load(0.0), 0.5, 0.1, 1.0), 0.5, 0.3, 1.0)
-    assert load.half_width_kg == pytest.approx(0.2)
-    assert after(*[0.5] * 50).half_width_kg == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("change_kg", [-2 * JUMP, 2 * JUMP])
@@ -147,12 +137,6 @@ def test_rests_whose_intervals_meet_do_not_disagree():
     wide = averaged(Load(0.0), 1.0, 0.2, 1.0)
     for kg, begins in ((0.65, False), (0.55, True)):
         assert averaged(averaged(wide, kg, 0.2, 1.0), kg, 0.2, 1.0).began is begins
-
-
-def test_a_lighter_arm_s_average_begins_anew_sooner():
-    load = averaged(averaged(Load(0.1, 3), 0.15, 0.0, 0.1), 0.15, 0.0, 0.1)
-    assert load == Load(0.15, 1, began=True)
-    assert not averaged(averaged(Load(0.1, 3), 0.15, 0.0, 1.0), 0.15, 0.0, 1.0).began
 
 
 def test_one_odd_rest_is_forgotten():

@@ -160,9 +160,3 @@ def test_gradient_of_an_impossible_length_is_finite():
     slope = jax.grad(lambda x: jnp.nansum(params.readings(x)))(lengths)
     assert np.isfinite(slope).all()
     assert slope[0] > 0 and slope[1] == slope[2] == 0
-
-
-def test_faults_are_described_with_spring_reading_and_expectation():
-    params, frequency = WIDE.spring_sensor, np.where(np.arange(9) == 6, 9.0e6, 4.0e6)
-    text = params.describe_faults(frequency, params.lengths(frequency).fault)
-    assert text.startswith("spring6: got 9000000 Hz, expected below 8761191 Hz, where the compensation")

@@ -5,12 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.env import ReachEnv
 from tests.train.small import CONFIG, LEARNER, SHORT
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
-from train.agent.imitation import ImitationConfig
-from train.agent.stages import GoalStage
+from train.agent.imitation import GoalStage, ImitationConfig
 from train.config import TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.runs import evaluate
@@ -44,15 +43,6 @@ def short_env(imitation_config):
 
 
 @pytest.fixture(scope="session")
-def moving_env():
-    """The short arm in motion, two control periods an action."""
-    motion = EnvConfig(
-        mode="dynamic", observation="motion", goal_ends=False, dynamic_step_s=0.04, n_poses=256
-    )
-    return ReachEnv(MOUNTED, motion)
-
-
-@pytest.fixture(scope="session")
 def shown(short_env):
     """Six demonstrated positions."""
     pool = short_env.pool
@@ -62,7 +52,7 @@ def shown(short_env):
 
 @pytest.fixture
 def shift_limit(monkeypatch):
-    """Limit (6,) of shifts of goals [mm, deg], whose first entry evaluations now tell as `near_s`."""
+    """Limit (6,) of shifts of goals [mm, deg], whose first entry evaluations report as `near_s`."""
 
     def limited(env, learner, policy, state, goal, n_actions, limit, take=evaluate.reach):
         after, result = take(env, learner, policy, state, goal, n_actions, limit)

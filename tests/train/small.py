@@ -3,7 +3,7 @@
 from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
-from train.agent.registry import World, learner_of
+from train.agent.registry import epoch_of
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 from train.epoch.job import Job
@@ -19,11 +19,11 @@ SETTINGS = {
     "vector_steps_per_epoch": 2,
 }
 LEARNER = TQCConfig(**SETTINGS, hidden=(16, 16), hidden_critic=(16, 16), learning_rate_end=0.1)
-CONFIG = TrainConfig(learner=LEARNER, env=EnvConfig(n_poses=256))
+CONFIG = TrainConfig(learner=LEARNER, env=EnvConfig(engine="chain", n_poses=256))  # compiles in seconds
 
 
-def new_job(config, env, **more):
-    return Job(config.learner, env, learner_of(config.learner, World(env)), **more)
+def new_job(config, env, mesh=None):
+    return Job(epoch_of(config.learner, env, mesh))
 
 
 def distil_little(monkeypatch):
@@ -37,4 +37,5 @@ def flags(**changes):
     """Options of a command that trains this short run for 16 epochs; changes are settings of the learner."""
     short = {"hidden": 16, "hidden_critic": 16, "total_env_steps": 256, "updates_per_env_step": 1}
     learner = {**SETTINGS, **short, "replay_capacity": 128, **changes}
-    return ["--env.n-poses=256", *(f"--learner.{name}={value}" for name, value in learner.items())]
+    options = (f"--learner.{name}={value}" for name, value in learner.items())
+    return ["--engine=chain", "--env.n-poses=256", *options]

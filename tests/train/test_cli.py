@@ -21,9 +21,8 @@ from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from tests.train.small import CONFIG, SHORT, distil_little, flags, new_job
 from train.__main__ import main
-from train.runs.checkpoint import Checkpoints, RunError
-from train.runs.folder import Run
-from train.runs.lock import sole_trainer
+from train.runs.checkpoint import RunError
+from train.runs.folder import Run, sole_trainer
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -56,6 +55,7 @@ def send_in_epoch_6(number):
     return log_and_send
 
 
+NEW = ["reach", *flags(), "--evaluation-epochs=4", "--spec"]
 DIES = """
 import signal, sys
 from tests.train.test_cli import Run, main, send_in_epoch_6
@@ -64,17 +64,22 @@ main(sys.argv[1:])
 """
 
 
-def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkeypatch, capsys):
+@pytest.fixture(scope="module")
+def whole(arm, tmp_path_factory):
+    """A run of 16 epochs, trained without a stop."""
     workspace._solver.cache_clear()  # others may have compiled it with other options than the process below
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    command = ["reach", *flags(), "--evaluation-epochs=4", "--spec", arm, "--out"]
-    assert main([*command, str(whole)]) == 0
-    like_here = {
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "JAX_NUM_CPU_DEVICES": "8",
-    }  # so little is compiled anew
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    assert main([*NEW, arm, "--out", str(out)]) == 0
+    return out
+
+
+def test_a_run_survives_kill_9_and_ends_with_the_same_bits(whole, arm, tmp_path, capsys):
+    killed = tmp_path / "killed"
+    same_programs = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_NUM_CPU_DEVICES": "8"}  # from the cache
     process = subprocess.run(
-        [sys.executable, "-c", DIES, *command, str(killed)], env={**os.environ, **like_here}, cwd=ROOT
+        [sys.executable, "-c", DIES, *NEW, arm, "--out", str(killed)],
+        env={**os.environ, **same_programs},
+        cwd=ROOT,
     )
     assert process.returncode == -signal.SIGKILL and not (killed / "evaluation.json").exists()
     assert Run.open(killed).checkpoints.latest == 4 and len(Run.open(killed).metrics()) == 6
@@ -86,28 +91,35 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     assert epoch == resumed_epoch == 16
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(expected), jax.device_get(resumed))
     assert [row["epoch"] for row in Run.open(killed).metrics()] == list(range(1, 17))
+    figures = [json.loads((run / "evaluation.json").read_text()) for run in (whole, killed)]
+    assert figures[0] == figures[1]
 
-    assert main(["evaluate", str(whole)]) == 0
+
+def test_the_folder_of_a_run_has_its_provenance_pictures_and_events(whole):
+    names = ("learning_curve.png", "circle.png", "workspace_error.png")
+    assert all((whole / name).stat().st_size > 10_000 for name in names)
+    assert list(whole.glob("events.out.tfevents.*"))
+    config = json.loads((whole / "config.json").read_text())
+    assert {"python", "packages", "commit"} <= config["provenance"].keys()
+
+
+def test_an_evaluation_with_a_payload_is_of_an_arm_that_carries_it(whole, monkeypatch):
     figures = json.loads((whole / "evaluation.json").read_text())
-    assert figures == json.loads((killed / "evaluation.json").read_text())
     carried_kg = []
     carrying = lambda spec, *rest: carried_kg.append(spec.mass.payload_kg) or ReachEnv(spec, *rest)  # noqa: E731
     monkeypatch.setattr("train.runs.command.ReachEnv", carrying)
     assert main(["evaluate", str(whole), "--payload", "50"]) == 0 and carried_kg == [0.05]
     loaded = json.loads((whole / "evaluation-50g.json").read_text())
     assert loaded.keys() == figures.keys() and loaded["median_mm"] != figures["median_mm"]
-    assert all(
-        (whole / name).stat().st_size > 10_000
-        for name in ("learning_curve.png", "circle.png", "workspace_error.png")
-    )
-    assert list(whole.glob("events.out.tfevents.*"))
-    config = json.loads((whole / "config.json").read_text())
-    assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
+
+@pytest.mark.slow
+def test_an_exported_policy_asks_for_the_same_lengths_on_a_later_calibration(
+    whole, tmp_path, monkeypatch, capsys
+):
     distil_little(monkeypatch)
     monkeypatch.setattr("train.runs.arm_model.N_WORKSPACE", 256)
     assert main(["export", str(whole)]) == 0
-    assert (whole / "policy.npz").exists()
 
     # Later, the springs' zeros have shifted, and the arm was seen at other lengths
     first, later = load_policy(whole / "policy.npz"), tmp_path / "later"
@@ -115,6 +127,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     shifted = {"delta_m": first.spec.sensor.delta_m + 0.002}
     lengths = {"length_min_m": 0.1, "length_max_m": 0.25}
     first.spec.replace(sensor=shifted, springs=lengths).to_toml(later / "arm.toml")
+    capsys.readouterr()
     assert main(["export", str(whole), "--calibration", str(later)]) == 0
     renewed = load_policy(whole / "policy-later.npz")
     for now, before in zip(renewed.actions[1:], first.actions[1:], strict=True):
@@ -151,7 +164,7 @@ def test_export_reads_the_policy_before_it_distils(tmp_path, monkeypatch, capsys
 def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):
     out = tmp_path / "stopped"
     monkeypatch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
-    assert main(["reach", *flags(), "--evaluation-epochs=4", "--spec", arm, "--out", str(out)]) == 130
+    assert main([*NEW, arm, "--out", str(out)]) == 130
     assert "continue with" in " ".join(capsys.readouterr().out.split())
     assert Run.open(out).checkpoints.latest == len(Run.open(out).metrics()) == 7
 
@@ -230,44 +243,32 @@ def demonstrations(tmp_path_factory):
     return str(path)
 
 
-def test_imitation_resumes_across_stages_and_hands_its_reward_on(
-    arm, demonstrations, tmp_path, monkeypatch, capsys
-):
+def test_imitation_hands_its_reward_and_its_layers_on(arm, demonstrations, tmp_path, capsys):
     # 8 epochs, the second stage from the fourth
     changes = {"total_env_steps": 128, "rebalance_env_steps": 48, "gail.hidden": 16}
-    settings = ["--evaluation-epochs=2", "--learner.stages", "0.5,2,1", "0.5,1,0.5", "--spec", arm]
+    settings = ["--evaluation-epochs=4", "--learner.stages", "0.5,2,1", "0.5,1,0.5", "--spec", arm]
     imitate = ["imitate", demonstrations, *flags(**changes), *settings, "--out"]
-    whole, killed, narrow = (tmp_path / name for name in ("whole", "killed", "narrow"))
-    assert main([*imitate, str(whole)]) == 0
-    assert all((whole / name).exists() for name in ("learning_curve.png", "losses.png", "positions.png"))
-
-    save = Checkpoints.save
-
-    def save_and_die(checkpoints, epoch, *rest):
-        save(checkpoints, epoch, *rest)
-        if epoch == 4:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Checkpoints, "save", save_and_die)
-    assert main([*imitate, str(killed)]) == 130
-    monkeypatch.setattr(Checkpoints, "save", save)
-    assert main(["imitate", "--resume", str(killed)]) == 0
-    figures = [json.loads((run / "evaluation.json").read_text()) for run in (whole, killed)]
-    assert figures[0] == figures[1] and len(figures[0]["error_mm"]) == 6
+    donor, heir = tmp_path / "donor", tmp_path / "heir"
+    assert main([*imitate, str(donor)]) == 0
+    assert all((donor / name).exists() for name in ("learning_curve.png", "losses.png", "positions.png"))
+    assert len(json.loads((donor / "evaluation.json").read_text())["error_mm"]) == 6
 
     capsys.readouterr()
-    assert main([*imitate, str(narrow), "--learner.frozen"]) == 2
+    assert main([*imitate, str(heir), "--learner.frozen"]) == 2
     assert "learner.frozen: got true, expected --reward RUN" in capsys.readouterr().err
     weights = ["--learner.learned-weight=0", "--learner.hand-made-weight=1"]
-    assert main([*imitate, str(narrow), *weights, "--reward", str(whole)]) == 2
+    assert main([*imitate, str(heir), *weights, "--reward", str(donor)]) == 2
     assert "learner.learned_weight: got 0 with --reward" in capsys.readouterr().err
-    assert not narrow.exists()
-    other = flags(**changes, hidden=8)  # the agent's layers are taken all the same
-    donors = ["--agent", str(whole), "--reward", str(whole)]
-    assert main(["imitate", demonstrations, *other, *settings, *donors, "--out", str(narrow)]) == 0
-    kept = [Run.open(run).checkpoints.parts()["reward"] for run in (whole, narrow)]
-    jax.tree.map(np.testing.assert_array_equal, *kept)
-    begun = json.loads((narrow / "config.json").read_text())["begins_with"]
-    assert begun == {"agent": str(whole), "reward": str(whole)}
-    learners = [Run.open(run).config.learner for run in (whole, narrow)]
+    assert main(["evaluate", str(donor), "--in-motion", "0.5"]) == 2
+    assert "--in-motion: got a run of `imitate`" in capsys.readouterr().err
+    assert not heir.exists()
+
+    narrow = flags(**changes, hidden=8)  # the agent's layers are taken all the same
+    donors = ["--agent", str(donor), "--reward", str(donor)]
+    assert main(["imitate", demonstrations, *narrow, *settings, *donors, "--out", str(heir)]) == 0
+    rewards = [Run.open(run).checkpoints.parts()["reward"] for run in (donor, heir)]
+    jax.tree.map(np.testing.assert_array_equal, *rewards)
+    begun = json.loads((heir / "config.json").read_text())["begins_with"]
+    assert begun == {"agent": str(donor), "reward": str(donor)}
+    learners = [Run.open(run).config.learner for run in (donor, heir)]
     assert [(each.hidden, each.frozen) for each in learners] == [((16,), False), ((16,), True)]

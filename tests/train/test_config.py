@@ -16,7 +16,7 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
     before = PRESETS["quick"]
     after = override(before, ["seed=3", "learner.gamma=0.25", "learner.hidden=[64, 32]", "env.engine=chain"])
     got = (after.seed, after.learner.gamma, after.learner.hidden, after.env.engine)
-    assert got == (3, 0.25, (64, 32), "mjx")
+    assert got == (3, 0.25, (64, 32), "chain")
     assert override(after, ["env.reward.threshold=1"]).env.reward.threshold == 1.0
     assert before.seed == 0 and before.env.engine == "mjx"
 
@@ -31,7 +31,10 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
         ("learner.n_arms=0", "learner.n_arms: got 0, expected at least 1"),
         ("learner.gamma=2", "learner.gamma: got 2.0, expected a number in [0, 1]"),
         ("learner.updates_per_env_step=0.001", "at least one update per step of all"),
-        ("learner.hindsight.near_share=2", "learner.hindsight.near_share"),
+        (
+            "learner.hindsight.near_share=2",
+            "hindsight.reached_share: got 0.2, expected 0 to 1",
+        ),
         ("learner.replay_capacity=10", "learner.replay_capacity: got 10, expected at least n_arms = 128"),
     ],
 )
@@ -78,8 +81,8 @@ def test_json_with_a_setting_too_many_is_refused_and_a_missing_one_has_its_defau
     assert from_dict({"learner": {"name": "tqc"}}) == TrainConfig()
 
 
-def test_runs_that_do_not_tell_their_activation_have_relu_networks():
-    data = to_dict(TrainConfig(learner=AnalyticConfig()))
+def test_runs_without_an_activation_have_relu_networks():
+    data = to_dict(PRESETS["analytic"])
     assert from_dict(data).learner.activation == "swish"
     del data["learner"]["activation"]
     assert from_dict(data).learner.activation == "relu"
@@ -130,4 +133,4 @@ def test_the_circle_has_the_reward_of_the_critics_that_it_may_begin_with():
 def test_two_learners_with_one_type_of_config_are_refused():
     """A run's JSON names its learner by that type."""
     with pytest.raises(TypeError, match="got TQCConfig for tqc and mine, expected a type for each"):
-        check_configs({**LEARNERS, "mine": LEARNERS["tqc"]._replace(make=LEARNERS["analytic"].make)})
+        check_configs({**LEARNERS, "mine": LEARNERS["tqc"]._replace(epoch=LEARNERS["analytic"].epoch)})

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,14 +32,15 @@ from jax import Array
 from jax.sharding import Mesh
 
 from mjx_softarm import control
-from mjx_softarm._support import draws
+from mjx_softarm._support import draws, xla
 from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv, choose_arms, over_arms
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Learner, LearnerConfig, Sample, check_settings
+from train.agent.learner import LearnerConfig, check_settings
 from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
+from train.epoch.devices import check_split, everywhere, split
 
 Params = Any  # a flax parameter tree
 MAX_GRADIENT_NORM = 1.0  # a longer gradient is shortened to this
@@ -49,7 +50,7 @@ EARLY = 0.2  # weight of the mean cost of all actions beside that of the last: t
 
 @dataclass(frozen=True)
 class AnalyticConfig(LearnerConfig):
-    """Hyperparameters of learning through the simulation. Raises ValueError naming a bad field."""
+    """Hyperparameters of learning through the simulation. Raises ConfigError naming a bad field."""
 
     VARIABLE = ("learning_rate", "learning_rate_half", "mean_share", "saturation_cost_per_mm")
 
@@ -76,20 +77,91 @@ class AnalyticConfig(LearnerConfig):
         check_settings("learner", self, required)
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ValueError for MJX's own time step in motion: its gradient is neither tested nor cheap."""
+        """Raise ConfigError for an engine whose gradient this learner does not take."""
         engine = "mjx" if env.moves else "chain"
         usable = env.engine == engine
         check_settings("env", env, {"engine": (usable, f"{engine!r}, whose gradient this learner takes")})
 
 
 class AnalyticState(NamedTuple):
-    """All that an update changes."""
+    """Policy and optimiser: all that a gradient step changes."""
 
     actor_params: Params
     mean_actor_params: Params  # average of the newest actor_params: the policy that is evaluated
     opt_state: optax.OptState
     n_steps: Array  # () int32 gradient steps taken
+
+
+class Analytic:
+    """Policy and optimiser of fixed structure, and pure functions of an `AnalyticState`.
+
+    Neither learning rate nor average depends on the length of the run, so every policy on the way is as
+    good as that of a shorter run.
+    """
+
+    def __init__(self, obs_size: int, action_size: int, config: AnalyticConfig):
+        self.obs_size, self.config = obs_size, config
+        self.actor: Any = Actor(action_size, config.hidden, config.activation)
+        self.optimizer = optax.chain(
+            optax.clip_by_global_norm(MAX_GRADIENT_NORM),
+            optax.adam(lambda n_steps: config.learning_rate / (1.0 + n_steps / config.learning_rate_half)),
+        )
+
+    def init(self, key: Array) -> AnalyticState:
+        """Return a fresh policy."""
+        params = self.actor.init(key, jnp.zeros((1, self.obs_size)))
+        n_steps = jnp.zeros((), jnp.int32)
+        return AnalyticState(params, own_buffers(params), self.optimizer.init(params), n_steps)
+
+    def policy(self, state: AnalyticState) -> Params:
+        """Return the parameters of the mean policy."""
+        return state.mean_actor_params
+
+    def mode(self, policy: Params, obs: Array) -> Array:
+        """Return the deterministic actions (..., A) in [-1, 1] at obs (..., O)."""
+        return mode(self.actor.apply(policy, obs)[0])
+
+    def parts(self, state: AnalyticState) -> dict[str, Params]:
+        """Return the policy, which checkpoints keep for export and for other runs."""
+        return {"policy": state.mean_actor_params}
+
+    def adopt(self, state: AnalyticState, parts: Mapping[str, Params]) -> AnalyticState:
+        """Return the state with another run's policy, of any learner; it may observe less.
+
+        Raises:
+            ValueError: the policy has another size.
+        """
+        params = widened(parts["policy"], self.obs_size)
+        check_same_shapes("actor", params, state.actor_params)
+        return state._replace(actor_params=params, mean_actor_params=own_buffers(params))
+
+    def update(self, state: AnalyticState, obs: Array, d_action: Array) -> tuple[AnalyticState, Array]:
+        """Take one gradient step.
+
+        Args:
+            state: state.
+            obs (..., O): observations.
+            d_action (..., A): derivatives of the loss by the policy's actions there.
+
+        Returns:
+            The next state; the norm of the gradient ().
+        """
+        _, pull_back = jax.vjp(lambda params: self.mode(params, obs), state.actor_params)
+        (gradient,) = pull_back(d_action)
+        actor_params, opt_state = descend(self.optimizer, gradient, state.opt_state, state.actor_params)
+        newest = 1.0 / (1.0 + self.config.mean_share * state.n_steps)
+        mean_params = optax.incremental_update(actor_params, state.mean_actor_params, newest)
+        next_state = AnalyticState(actor_params, mean_params, opt_state, state.n_steps + 1)
+        return next_state, optax.tree.norm(gradient)
+
+
+class GradientState(NamedTuple):
+    """All that a run consists of; with it, a run continues bit for bit."""
+
     arms: State  # B
+    learner: AnalyticState
+    key: Array
+    n_epochs: Array  # () int32 epochs done
 
 
 class _Ahead(NamedTuple):
@@ -100,104 +172,78 @@ class _Ahead(NamedTuple):
     valid: Array  # () bool: the arm settled after each action
 
 
-class Analytic(Learner):
-    """`Learner` by the gradient of the simulation; it uses no replay.
-
-    Neither learning rate nor average depends on the length of the run, so every policy on the way is as
-    good as that of a shorter run.
+class GradientEpoch:
+    """Epoch of gradient steps, each with one action of all arms.
 
     Args:
         config: hyperparameters.
         env: the arm.
-        mesh: devices over which the arms are spread.
+        mesh: devices over which the arms are spread, if there are several. Raises ConfigError where these
+            cannot be split evenly.
     """
 
-    own_arms = True
+    kind: xla.Kind = "arm"
 
     def __init__(self, config: AnalyticConfig, env: ReachEnv, mesh: Mesh | None = None):
         self.config, self.env, self.mesh = config, env, mesh
-        self.actor: Any = Actor(env.action_size, config.hidden, config.activation)
+        self.learner = Analytic(env.observation_size, env.action_size, config)
         self.arms = VectorEnv(env, config.n_arms, episode_length=1, mesh=mesh)
-        self.optimizer = optax.chain(
-            optax.clip_by_global_norm(MAX_GRADIENT_NORM),
-            optax.adam(lambda n_steps: config.learning_rate / (1.0 + n_steps / config.learning_rate_half)),
-        )
+        self.sharding = None
+        if mesh is not None:  # arms are spread, the networks are on all devices
+            check_split(config, ("n_arms",), mesh)
+            rows, on_all = cast(Any, split(mesh)), cast(Any, everywhere(mesh))  # stand-ins for arrays
+            self.sharding = GradientState(rows, on_all, on_all, on_all)
 
-    def init(self, key: Array) -> AnalyticState:
-        """Return a fresh policy, and arms at random poses."""
-        key_actor, key_arms = jax.random.split(key)
-        params = self.actor.init(key_actor, jnp.zeros((1, self.env.observation_size)))
-        return AnalyticState(
-            actor_params=params,
-            mean_actor_params=own_buffers(params),
-            opt_state=self.optimizer.init(params),
-            n_steps=jnp.zeros((), jnp.int32),
-            arms=self.arms.reset(key_arms),
-        )
+    def first(self, key: Array) -> GradientState:
+        """Return the state that a run begins with: a fresh policy, and arms at random poses."""
+        key, _, key_learner, _ = jax.random.split(key, 4)
+        key_actor, key_arms = jax.random.split(key_learner)
+        n_epochs = jnp.zeros((), jnp.int32)
+        return GradientState(self.arms.reset(key_arms), self.learner.init(key_actor), key, n_epochs)
 
-    def adopt(self, state: AnalyticState, parts: Mapping[str, Params]) -> AnalyticState:
-        """Return the state with another run's policy, of any learner; it may observe less.
+    def advance(self, state: GradientState) -> tuple[GradientState, dict[str, Array]]:
+        """Take `vector_steps_per_epoch` gradient steps.
 
-        Raises:
-            ValueError: the policy has another size.
+        Returns:
+            The next state; means over the epoch by name. `env/unsettled` is the number of arms that did not
+            settle.
         """
-        params = widened(parts["policy"], self.env.observation_size)
-        check_same_shapes("actor", params, state.actor_params)
-        return state._replace(actor_params=params, mean_actor_params=own_buffers(params))
+        with draws.on(self.mesh):
+            state, metrics = jax.lax.scan(self._step, state, None, length=self.config.vector_steps_per_epoch)
+        unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
+        state = state._replace(n_epochs=state.n_epochs + 1)
+        return state, jax.tree.map(jnp.mean, metrics) | {"env/unsettled": unsettled}
 
-    def act(self, state: AnalyticState, obs: Array, key: Array) -> Array:
-        """Return the policy's actions (..., A) at obs (..., O): nothing needs to be explored."""
-        return self.mode(state.actor_params, obs)
-
-    def policy(self, state: AnalyticState) -> Params:
-        """Return the parameters of the mean policy."""
-        return state.mean_actor_params
-
-    def mode(self, policy: Params, obs: Array) -> Array:
-        """Return the deterministic actions (..., A) in [-1, 1] at obs (..., O)."""
-        return mode(self.actor.apply(policy, obs)[0])
-
-    def update(
-        self, state: AnalyticState, sample: Sample, key: Array
-    ) -> tuple[AnalyticState, dict[str, Array]]:
+    def _step(self, state: GradientState, _) -> tuple[GradientState, dict[str, Array]]:
         """Take one gradient step, and one action of all arms."""
+        key, key_arms = jax.random.split(state.key)
         # Act H times, and differentiate each arm's loss by each of its actions.
-        look_ahead = jax.value_and_grad(self._loss, has_aux=True)
+        look_ahead = over_arms(jax.value_and_grad(self._loss, has_aux=True), self.mesh, 1)
         changes = jnp.zeros((self.arms.n, self.config.horizon, self.env.action_size))
         ahead: _Ahead
         d_action: Array  # (B, H, A)
-        (loss, ahead), d_action = over_arms(look_ahead, self.mesh, 1)(changes, state.arms, state.actor_params)
+        (loss, ahead), d_action = look_ahead(changes, state.arms, state.learner.actor_params)
 
         # Leave out arms that did not settle, and gradients that are not finite, as at a pitch of 90 degrees.
         valid = ahead.valid & jnp.all(jnp.isfinite(d_action), axis=(1, 2))  # (B,)
         d_action = jnp.where(valid[:, None, None], d_action, jnp.zeros_like(d_action)) / self.arms.n
-        _, pull_back = jax.vjp(lambda params: self.mode(params, ahead.obs), state.actor_params)
-        (gradient,) = pull_back(d_action)
-        after = ahead.after
 
-        # Descend.
-        actor_params, opt_state = descend(self.optimizer, gradient, state.opt_state, state.actor_params)
-        newest = 1.0 / (1.0 + self.config.mean_share * state.n_steps)
-        next_state = AnalyticState(
-            actor_params=actor_params,
-            mean_actor_params=optax.incremental_update(actor_params, state.mean_actor_params, newest),
-            opt_state=opt_state,
-            n_steps=state.n_steps + 1,
-            arms=self._go_on(after, key),
-        )
+        # Descend, and let the arms go on.
+        learner, gradient_norm = self.learner.update(state.learner, ahead.obs, d_action)
         metrics = {
             "loss": jnp.sum(loss, where=valid) / jnp.maximum(jnp.sum(valid), 1),
-            "gradient_norm": optax.tree.norm(gradient),
+            "gradient_norm": gradient_norm,
             "left_out": jnp.mean(~valid),
         }
-        env_metrics = {f"env/{name}": jnp.mean(x) for name, x in after.metrics.items()}
-        return next_state, env_metrics | {f"analytic/{name}": x for name, x in metrics.items()}
+        env_metrics = {f"env/{name}": jnp.mean(x) for name, x in ahead.after.metrics.items()}
+        state = state._replace(arms=self._go_on(ahead.after, key_arms), learner=learner, key=key)
+        return state, env_metrics | {f"analytic/{name}": x for name, x in metrics.items()}
 
     def _loss(self, changes: Array, arm: State, params: Params) -> tuple[Array, _Ahead]:
         """Return the loss of one arm over H actions of the policy plus small changes (H, A)."""
 
         def act(arm: State, change: Array) -> tuple[State, tuple[Array, State, Array]]:
-            action = self.mode(params, arm.obs) + change
+            action = self.learner.mode(params, arm.obs) + change
             after = self.env.step(arm, action)
             return after, (self._cost(action, after), after, arm.obs)
 

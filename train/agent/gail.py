@@ -1,4 +1,4 @@
-"""Discriminator that tells the expert's actions from the agent's, and the reward learned by it.
+"""Discriminator between the expert's actions and the agent's, and the reward that it learns.
 
 The logit h(s, a, g) is high where the expert acts. It is trained by cross-entropy, expert 1 and agent 0. A
 penalty holds the length of its gradient near one at points between both. The paper's penalty is on the

@@ -57,8 +57,8 @@ def relabel(
     *,
     goal_ends: bool,
     senses_action: bool,
-) -> tuple[Transition, Array]:
-    """Return a batch to learn from, and which of its rows (B,) have another goal.
+) -> Transition:
+    """Return a batch to learn from; some of its transitions have another goal.
 
     With both shares zero, the rewards are the environment's own.
 
@@ -96,14 +96,15 @@ def relabel(
     before, after = batch.sensed, batch.next_sensed
     if senses_action and after is not None:
         after = after.at[:, -action.shape[1] :].set(action)  # the last action, exchanged
-    transition = Transition(
+    return Transition(
         obs=_joined(obs.observe(batch.pose, goal, scale, reward_config), before),
         action=action,
         reward=reward,
         next_obs=_joined(obs.observe(batch.next_pose, goal, scale, reward_config), after),
         terminated=(done & goal_ends).astype(reward.dtype),
+        stored=batch,
+        relabelled=reached | near,
     )
-    return transition, reached | near
 
 
 def later_pose(now: Experience, later: Experience, ahead: Array) -> Array:

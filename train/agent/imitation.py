@@ -1,8 +1,8 @@
-"""Learner from demonstrations: a learned reward around TQC.
+"""Learner from demonstrations: a learned reward around TQC, and demonstrated positions as goals.
 
-At rest an action leads to the same pose from every start. So a demonstrated action is the expert's answer to
-its goal from any start, and expert actions are stored with the agent's state: the discriminator compares two
-actions for one observation. The expert's answers also take a share of each batch of the critics.
+The arm is at rest: an action leads to the same pose from every start. So a demonstrated action is the answer
+to its goal from any start, and expert actions are stored with the agent's state: the discriminator compares
+two actions for one observation. The expert's answers also take a share of each batch of the critics.
 
 The learned reward is for goals that were asked for; the discriminator does not know relabelled goals. The
 reward is never positive, and an episode ends with the goal reached or by the clock, so delay earns nothing.
@@ -17,29 +17,72 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from tyro.constructors import PrimitiveConstructorSpec
 
+from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.env.state import State
+from mjx_softarm.env.vector import choose_arms
 from mjx_softarm.mdp import rewards
 from train.agent.gail import DiscriminatorState, Gail, GailConfig
-from train.agent.learner import Experience, Learner, Sample, Transition, check_settings
+from train.agent.learner import Transition, check_settings
 from train.agent.networks import check_same_shapes
-from train.agent.stages import STAGES_OPTION, GoalStage
-from train.agent.tqc import HindsightTQC, TQCConfig
+from train.agent.tqc import TQC, TQCConfig, TQCState
 from train.demos.demonstrations import Demonstrations, shown_before
+from train.epoch import replay
+from train.epoch.replay_epoch import ReplayState
 
 ExpertStart = Literal["agent", "shown"]
+EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they are reached
+
+
+@dataclass(frozen=True)
+class GoalStage:
+    """A part of the schedule of demonstrated goals."""
+
+    share: float = 1.0  # share of the run's environment steps
+    every: int = 1  # every n-th demonstrated pose is a goal; 1 is all of them
+    kept: float = 1.0  # share of the replay's transitions that is kept as the stage begins
+
+    def __post_init__(self) -> None:
+        required = {
+            "share": (0.0 < self.share <= 1.0, "more than 0 and at most 1"),
+            "every": (self.every >= 1, "at least 1"),
+            "kept": (0.0 <= self.kept <= 1.0, "0 to 1"),
+        }
+        check_settings("learner.stages", self, required)
+
+
+def _stages(words: list[str]) -> tuple[GoalStage, ...]:
+    stages = []
+    for word in words:
+        numbers = word.split(",")
+        if len(numbers) != 3:
+            raise ValueError(f"got {word!r}, expected SHARE,EVERY,KEPT")
+        stages.append(GoalStage(float(numbers[0]), int(numbers[1]), float(numbers[2])))
+    return tuple(stages)
+
+
+STAGES_OPTION = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="SHARE,EVERY,KEPT",
+    instance_from_str=_stages,
+    is_instance=lambda value: isinstance(value, tuple),
+    str_from_instance=lambda stages: [f"{stage.share:.3g},{stage.every},{stage.kept:g}" for stage in stages],
+)
 
 
 @dataclass(frozen=True)
 class ImitationConfig(TQCConfig):
-    """Settings of learning from demonstrations, whose poses are the goals. Raises ValueError."""
+    """Settings of learning from demonstrations, whose poses are the goals. Raises ConfigError."""
 
     gail: GailConfig = field(default_factory=GailConfig)
     """discriminator"""
@@ -80,7 +123,7 @@ class ImitationConfig(TQCConfig):
         check_settings("learner", self, required)
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ValueError for an environment that does not suit demonstrations.
+        """Raise ConfigError for an environment that does not suit demonstrations.
 
         A demonstrated action leads to one pose from every start, at rest and with one payload alone.
         """
@@ -111,81 +154,82 @@ class ImitationConfig(TQCConfig):
 class ImitationState(NamedTuple):
     """All that an update changes."""
 
-    agent: Any  # state of the wrapped learner
+    agent: TQCState
     discriminator: DiscriminatorState | None  # None where no reward is learned or taken
 
 
-class Imitation(Learner):
-    """`Learner` that wraps TQC and replaces its rewards and some rows of its batches."""
+class Imitation:
+    """TQC with a learned reward, and the expert's answers in some rows of its batches."""
 
     def __init__(self, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations):
-        self.learner, self.config, self.env = HindsightTQC(config, env), config, env
+        self.config, self.env = config, env
+        self.tqc = TQC(env.observation_size, env.action_size, config)
+        self.gail = Gail(env.observation_size, env.action_size, config.gail)
+        self.mode = self.tqc.mode
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
         self.actions = jnp.asarray(demonstrations.actions)  # (m, A)
         self.before = jnp.asarray(shown_before(demonstrations.sequence))  # (m,)
-        self.gail = Gail(env.observation_size, env.action_size, config.gail)
         self.n_expert = round(config.expert_share * config.batch_size)  # rows of a batch
-        self.mode = self.learner.mode
 
     def init(self, key: Array) -> ImitationState:
         """Return fresh networks."""
         key_agent, key_discriminator = jax.random.split(key)
         discriminator = self.gail.init(key_discriminator) if self.config.learned_weight else None
-        return ImitationState(self.learner.init(key_agent), discriminator)
+        return ImitationState(self.tqc.init(key_agent), discriminator)
 
     def act(self, state: ImitationState, obs: Array, key: Array) -> Array:
-        """Return the wrapped learner's exploring actions."""
-        return self.learner.act(state.agent, obs, key)
-
-    def policy(self, state: ImitationState) -> Any:
-        """Return the wrapped learner's policy."""
-        return self.learner.policy(state.agent)
+        """Return TQC's exploring actions."""
+        return self.tqc.act(state.agent, obs, key)
 
     def update(
-        self, state: ImitationState, sample: Sample, key: Array
+        self, state: ImitationState, batch: Transition, key: Array
     ) -> tuple[ImitationState, dict[str, Array]]:
-        """Take one gradient step of the discriminator, and with its reward one of the wrapped learner."""
-        key_sample, key_between, key_relabel, key_update = jax.random.split(key, 4)
-        discriminator, metrics = state.discriminator, {}
+        """Take one gradient step of the discriminator, and with its reward one of TQC."""
+        key_between, key_update = jax.random.split(key)
+        discriminator, metrics, stored = state.discriminator, {}, batch.stored
+        assert stored is not None  # the epoch gives it
+        index = self._index_of(stored.goal)  # (B,) demonstrated positions that are the goals
 
-        # Batch: stored transitions, relabelled; the first rows are exchanged for the expert's.
-        stored = sample(key_sample, self.config.hindsight.n_later)
-        index = self._index_of(stored.goal)  # (B,)
-        batch, relabelled = self.learner.transitions(stored, key_relabel)
-        batch = self.with_expert(batch, stored, index)
-        relabelled = relabelled.at[: self.n_expert].set(False)
+        # Batch: the first rows are exchanged for the expert's.
+        batch = self.with_expert(batch, index)
+        relabelled = cast(Array, batch.relabelled)
 
         # Discriminator: the expert's actions against the agent's, at one observation or as in the paper.
         if self.config.expert_start == "shown":
             start = self.env.observe(self.positions[self.before[index]], self.positions[index])  # (B, O)
             pairs = (start, self.actions[index]), (batch.obs, batch.action)
-            relabelled = jnp.zeros_like(relabelled)  # their goals are known to the discriminator
+            without_reward = jnp.zeros_like(relabelled)  # the discriminator knows relabelled goals
         else:
             start = self.env.observe(stored.pose, stored.goal)  # (B, O)
             pairs = (start, self.actions[index]), (start, stored.action)
+            without_reward = relabelled
         if discriminator is not None and not self.config.frozen:
             discriminator, metrics = self.gail.update(discriminator, *pairs, key_between)
 
         # Agent: the batch with rewards of the updated discriminator.
-        reward, of_reward = self.rewards(batch, stored, relabelled, discriminator)
-        agent, losses = self.learner.learn(state.agent, batch._replace(reward=reward), key_update)
-        metrics = {f"gail/{name}": x for name, x in (metrics | of_reward).items()}
+        reward, learned = self.rewards(batch, without_reward, discriminator)
+        agent, losses = self.tqc.update(state.agent, batch._replace(reward=reward), key_update)
+        metrics = {f"gail/{name}": x for name, x in (metrics | learned).items()}
         return ImitationState(agent, discriminator), losses | metrics
 
+    def policy(self, state: ImitationState) -> Any:
+        """Return TQC's policy."""
+        return self.tqc.policy(state.agent)
+
     def parts(self, state: ImitationState) -> dict[str, Any]:
-        """Return the parts of the wrapped learner, and the discriminator's parameters as `reward`."""
-        parts = self.learner.parts(state.agent)
+        """Return the parts of TQC, and the discriminator's parameters as `reward`."""
+        parts = self.tqc.parts(state.agent)
         return parts if state.discriminator is None else parts | {"reward": state.discriminator.params}
 
     def adopt(self, state: ImitationState, parts: Mapping[str, Any]) -> ImitationState:
-        """Return the state with a learned reward, with networks of the wrapped learner, or with both.
+        """Return the state with a learned reward, with networks of TQC, or with both.
 
         Raises:
             ValueError: a part has another size, or the networks are not those of TQC.
         """
         networks = {name: part for name, part in parts.items() if name != "reward"}
         if networks:
-            state = state._replace(agent=self.learner.adopt(state.agent, networks))
+            state = state._replace(agent=self.tqc.adopt(state.agent, networks))
         if "reward" in parts:
             assert state.discriminator is not None  # a learned reward without weight is refused before
             check_same_shapes("discriminator", parts["reward"], state.discriminator.params)
@@ -193,50 +237,129 @@ class Imitation(Learner):
         return state
 
     def rewards(
-        self,
-        batch: Transition,
-        stored: Experience,
-        relabelled: Array,
-        discriminator: DiscriminatorState | None,
+        self, batch: Transition, without_reward: Array, discriminator: DiscriminatorState | None
     ) -> tuple[Array, dict[str, Array]]:
         """Return the rewards (B,) of a batch, and metrics.
 
         The cost of the body's clearance is charged whatever the weights; the expert keeps clear.
 
         Args:
-            batch: made of `stored`, the expert's rows first.
-            stored: B transitions.
-            relabelled (B,) bool: rows of the batch with a goal that was not asked for.
+            batch: batch, the expert's rows first.
+            without_reward (B,) bool: rows whose goal the discriminator does not know.
             discriminator: discriminator that gives the learned reward, if there is one.
         """
-        cost = stored.clearance_cost.at[: self.n_expert].set(0.0)  # (B,)
+        assert batch.stored is not None
+        cost = batch.stored.clearance_cost.at[: self.n_expert].set(0.0)  # (B,)
         reward = self.config.hand_made_weight * (batch.reward + cost) - cost  # (B,)
         if discriminator is None:
             return reward, {}
         learned = self.gail.reward(discriminator.params, batch.obs, batch.action)  # (B,)
-        learned = jnp.where(relabelled, 0.0, learned)
-        mean = jnp.sum(learned) / jnp.maximum(jnp.sum(~relabelled), 1)
+        learned = jnp.where(without_reward, 0.0, learned)
+        mean = jnp.sum(learned) / jnp.maximum(jnp.sum(~without_reward), 1)
         return reward + self.config.learned_weight * learned, {"reward": mean}
 
-    def with_expert(self, batch: Transition, stored: Experience, index: Array) -> Transition:
+    def with_expert(self, batch: Transition, index: Array) -> Transition:
         """Return a batch whose first rows are the expert's answers, from the same starts to the same goals.
 
-        `index` (B,) gives the demonstrated positions that are the goals of the B transitions `stored`.
+        `index` (B,) gives the demonstrated positions that are the goals of the stored transitions.
         """
-        n = self.n_expert
+        n, stored = self.n_expert, batch.stored
+        assert stored is not None
         goal = self.positions[index[:n]]  # (n, 6)
         reward, reached, _ = rewards.reward(
             goal, goal, stored.n_steps[:n], jnp.zeros(n, bool), self.env.config.reward
         )
-        expert = Transition(
-            obs=self.env.observe(stored.pose[:n], goal),
-            action=self.actions[index[:n]],
-            reward=reward,
-            next_obs=self.env.observe(goal, goal),
-            terminated=reached.astype(reward.dtype),
+        expert = {
+            "obs": self.env.observe(stored.pose[:n], goal),
+            "action": self.actions[index[:n]],
+            "reward": reward,
+            "next_obs": self.env.observe(goal, goal),
+            "terminated": reached.astype(reward.dtype),
+            "relabelled": jnp.zeros(n, bool),
+        }
+        return batch._replace(
+            **{name: jnp.concatenate([rows, getattr(batch, name)[n:]]) for name, rows in expert.items()}
         )
-        return jax.tree.map(lambda e, b: jnp.concatenate([e, b[n:]]), expert, batch)
 
     def _index_of(self, goal: Array) -> Array:
         """Return the indices (...) of the demonstrated positions that are the goals (..., 6)."""
         return jnp.argmin(jnp.sum((goal[..., None, :] - self.positions) ** 2, axis=-1), axis=-1)
+
+
+class DemonstratedGoals:
+    """Starts and goals among m demonstrated positions; the state is the goals' weights (m,).
+
+    An episode goes from one position to another. Starts are all of them; goals of the first stage are some of
+    them, those of later stages more. Between epochs, goals shift to the positions with the largest errors.
+    """
+
+    def __init__(self, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations):
+        self.config, self.env = config, env
+        self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
+        self._thin = xla.jit(replay.thin, donate_argnums=0)
+
+    def init(self) -> Array:
+        """Return the weights of the first stage."""
+        return jnp.asarray(self.of_stage(0), jnp.float32)
+
+    def begin(self, state: Array, arms: State, key: Array) -> State:
+        """Return n arms; a new episode begins at one demonstrated position, with another for its goal."""
+        key_start, key_goal = jax.random.split(key)
+        arm, n = arms.pipeline_state, len(arms.obs)
+        start = jax.random.randint(key_start, (n,), 0, len(self.positions))
+        goal = jax.random.categorical(key_goal, jnp.log(state), shape=(n,))
+        fresh = arm._replace(pose=self.positions[start], goal=self.positions[goal])
+        arm = choose_arms(arm.n_steps == 0, fresh, arm)
+        return arms.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, arm.goal))
+
+    def of_stage(self, epoch: int) -> np.ndarray:
+        """Return which positions (m,) are goals in an epoch: bool."""
+        stage = int(np.searchsorted(self.config.stage_epochs, epoch, side="right")) - 1
+        return np.arange(len(self.positions)) % self.config.stages[stage].every == 0
+
+    def prepare(
+        self, state: ReplayState, epoch: int, errors_mm: Callable[[], Sequence[float]]
+    ) -> ReplayState:
+        """Return the state before an epoch: a stage begins, or goals shift to the largest errors.
+
+        Args:
+            state: state of the run.
+            epoch: number of epochs done.
+            errors_mm: returns the tip errors (m,) at the positions.
+        """
+        every = self.config.rebalance_epochs
+        if every and epoch and epoch % every == 0 and epoch not in self.config.stage_epochs:
+            return self.rebalance(state, epoch, errors_mm())
+        return self.begin_stage(state, epoch)
+
+    def begin_stage(self, state: ReplayState, epoch: int) -> ReplayState:
+        """Return the state with the goals of the stage that begins before an epoch, and a thinner replay.
+
+        It is the state as given where no stage begins; else the state given is used up.
+        """
+        if epoch not in self.config.stage_epochs:
+            return state
+        kept = self.config.stages[self.config.stage_epochs.index(epoch)].kept
+        if kept < 1.0 and epoch:
+            key, key_thin = jax.random.split(state.key)
+            memory = self._thin(state.memory, key_thin, jnp.asarray(kept, jnp.float32))
+            state = state._replace(memory=memory, key=key)
+        return state._replace(goals=jnp.asarray(self.of_stage(epoch), jnp.float32))
+
+    def rebalance(
+        self, state: ReplayState, epoch: int, error_mm: Sequence[float] | np.ndarray
+    ) -> ReplayState:
+        """Return the state with goals shifted to the positions (m,) with the largest errors [mm]."""
+        return state._replace(goals=jnp.asarray(goal_weights(error_mm, self.of_stage(epoch))))
+
+
+def goal_weights(error_mm: Sequence[float] | np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Return how often each position is the goal: a share evenly, the rest in proportion to its error.
+
+    Args:
+        error_mm (m,): tip errors at the positions now.
+        goals (m,) bool: positions that are goals at all.
+    """
+    error = np.where(goals, error_mm, 0.0)
+    by_error = error / error.sum() if error.sum() > 0 else goals / goals.sum()
+    return (EVEN_SHARE * goals / goals.sum() + (1.0 - EVEN_SHARE) * by_error).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Actor and critic networks, and the tanh-squashed Gaussian that the actor parametrises."""
+"""The policy network of every learner, and the tanh-squashed Gaussian that it parametrises."""
 
 from typing import Any
 
@@ -12,7 +12,6 @@ from mjx_softarm.mdp.observation import OBS_SIZE
 
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
-COST_AHEAD = 40.0  # initial weight of a predicted error of 1, summed over the predictions
 
 
 class Actor(nn.Module):
@@ -72,54 +71,6 @@ def check_same_shapes(name: str, given: Any, own: Any) -> None:
     got, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (given, own))
     if got != expected:
         raise ValueError(f"{name}: got layers of {got}, expected {expected} as in the new run")
-
-
-class Critics(nn.Module):
-    """An ensemble of independent quantile networks of (observation, action).
-
-    All critics read the same input, so their first layers are one matrix whose columns are split among them.
-    Deeper layers are a matrix per critic. No parameter is shared. On a CPU this is faster than a vmapped
-    ensemble, which transposes at every layer.
-
-    Attributes:
-        n_critics: number of critics C.
-        n_quantiles: quantiles per critic M.
-        hidden: width of each hidden layer of one critic, at least one.
-        layer_norm: normalise each hidden layer before its ReLU.
-    """
-
-    n_critics: int = 2
-    n_quantiles: int = 25
-    hidden: tuple[int, ...] = (256, 256)
-    layer_norm: bool = False
-
-    @nn.compact
-    def __call__(self, obs: jax.Array, action: jax.Array, ahead: jax.Array | None = None) -> jax.Array:
-        """Return the quantiles (..., C, M) of the return, unsorted, at obs (..., O) and action (..., A).
-
-        With errors (..., K, 6) that are predicted after the action, the quantiles fall with their norms.
-        """
-        inputs = [obs, action]
-        if ahead is not None:
-            norms = jnp.sqrt(jnp.sum(ahead**2, axis=-1) + 1e-8)  # (..., K)
-            inputs += [ahead.reshape(*ahead.shape[:-2], -1), norms]
-        x = jnp.concatenate(inputs, axis=-1)  # (..., O + A, and 7 K)
-        first = nn.Dense(self.n_critics * self.hidden[0], name="hidden_0")(x)  # (..., C * H_0)
-        quantiles = []
-        for c, x in enumerate(jnp.split(first, self.n_critics, axis=-1)):  # (..., H_0)
-            x = self._activate(x, f"critic_{c}_norm_0")
-            for i, width in enumerate(self.hidden[1:], start=1):
-                x = nn.Dense(width, name=f"critic_{c}_hidden_{i}")(x)  # (..., H_i)
-                x = self._activate(x, f"critic_{c}_norm_{i}")
-            quantiles.append(nn.Dense(self.n_quantiles, name=f"critic_{c}_head")(x))  # (..., M)
-            if ahead is not None:
-                initial = nn.initializers.constant(jnp.log(jnp.expm1(COST_AHEAD / norms.shape[-1])))
-                cost = nn.softplus(self.param(f"critic_{c}_cost", initial, norms.shape[-1:]))  # (K,)
-                quantiles[c] -= jnp.sum(cost * norms, axis=-1, keepdims=True)
-        return jnp.stack(quantiles, axis=-2)  # (..., C, M)
-
-    def _activate(self, x: jax.Array, norm_name: str) -> jax.Array:
-        return nn.relu(nn.LayerNorm(name=norm_name)(x) if self.layer_norm else x)
 
 
 def squash(mean: jax.Array, log_std: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -11,42 +11,57 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 
 from mjx_softarm.env import ReachEnv
-from train.agent.analytic import Analytic, AnalyticConfig
-from train.agent.imitation import Imitation, ImitationConfig
-from train.agent.learner import Learner, LearnerConfig
-from train.agent.tqc import HindsightTQC, TQCConfig
+from train.agent.analytic import AnalyticConfig, GradientEpoch
+from train.agent.imitation import DemonstratedGoals, Imitation, ImitationConfig
+from train.agent.learner import ConfigError, LearnerConfig
+from train.agent.tqc import TQC, TQCConfig
 from train.demos.demonstrations import Demonstrations
-
-
-class World(NamedTuple):
-    """Environment of a learner, with devices and demonstrations where there are any."""
-
-    env: ReachEnv
-    mesh: Mesh | None = None
-    demonstrations: Demonstrations | None = None
+from train.epoch.job import Epoch
+from train.epoch.replay_epoch import Learner, ReplayEpoch
 
 
 class Entry(NamedTuple):
-    """A learner: its config's type, and the function that makes it of a config."""
+    """A learner: its config's type, and the function that makes its epoch."""
 
     config: type[LearnerConfig]
-    make: Callable[[Any, World], Learner]
+    epoch: Callable[[Any, ReachEnv, Mesh | None, Demonstrations | None], Epoch]
     from_demonstrations: bool = False  # whether its goals are demonstrated poses, as `train imitate` has them
 
 
+def with_replay(learner: Callable[[int, int, Any], Learner]) -> Callable[..., Epoch]:
+    """Return the function that makes the epoch of a learner from the replay.
+
+    Args:
+        learner: its class, called with the sizes of observation and action and with its config.
+    """
+
+    def epoch(config: Any, env: ReachEnv, mesh: Mesh | None, _: Demonstrations | None) -> Epoch:
+        return ReplayEpoch(config, env, learner(env.observation_size, env.action_size, config), mesh=mesh)
+
+    return epoch
+
+
+def _gradient(config: Any, env: ReachEnv, mesh: Mesh | None, _: Demonstrations | None) -> Epoch:
+    return GradientEpoch(config, env, mesh)
+
+
+def _imitation(config: Any, env: ReachEnv, mesh: Mesh | None, shown: Demonstrations | None) -> Epoch:
+    if shown is None:
+        raise ConfigError("learner: got 'imitation' without demonstrations, expected a file of them")
+    return ReplayEpoch(
+        config, env, Imitation(config, env, shown), DemonstratedGoals(config, env, shown), mesh
+    )
+
+
 LEARNERS = {
-    "tqc": Entry(TQCConfig, lambda config, world: HindsightTQC(config, world.env)),
-    "analytic": Entry(AnalyticConfig, lambda config, world: Analytic(config, world.env, world.mesh)),
-    "imitation": Entry(
-        ImitationConfig,
-        lambda config, world: Imitation(config, world.env, world.demonstrations),
-        from_demonstrations=True,
-    ),
+    "tqc": Entry(TQCConfig, with_replay(TQC)),
+    "analytic": Entry(AnalyticConfig, _gradient),
+    "imitation": Entry(ImitationConfig, _imitation, from_demonstrations=True),
 }
 
 
 def check_configs(learners: Mapping[str, Entry]) -> None:
-    """Raise TypeError where two learners share a type of config: the type tells the learner in `name_of`."""
+    """Raise TypeError where two learners share a type of config, from which `name_of` finds the learner."""
     by_type: dict[type[LearnerConfig], str] = {}
     for name, entry in learners.items():
         if (other := by_type.setdefault(entry.config, name)) != name:
@@ -63,6 +78,23 @@ def name_of(config: LearnerConfig) -> str:
     return next(name for name, entry in LEARNERS.items() if type(config) is entry.config)
 
 
-def learner_of(config: LearnerConfig, world: World) -> Learner:
-    """Return the learner that a config is for."""
-    return LEARNERS[name_of(config)].make(config, world)
+def learns_from_demonstrations(config: LearnerConfig) -> bool:
+    """Return whether the goals of a config's learner are demonstrated poses."""
+    return LEARNERS[name_of(config)].from_demonstrations
+
+
+def epoch_of(
+    config: LearnerConfig, env: ReachEnv, mesh: Mesh | None = None, shown: Demonstrations | None = None
+) -> Epoch:
+    """Return the epoch of the learner that a config is for.
+
+    Args:
+        config: settings of the learner.
+        env: the arm.
+        mesh: devices, if there are several.
+        shown: demonstrations, for a learner from these.
+
+    Raises:
+        ConfigError: demonstrations are missing, or something cannot be split evenly over the devices.
+    """
+    return LEARNERS[name_of(config)].epoch(config, env, mesh, shown)

@@ -1,44 +1,53 @@
 """Truncated quantile critics: an off-policy actor-critic with a learned temperature.
 
 Kuznetsov et al. 2020, arXiv:2005.04269, on top of soft actor-critic, Haarnoja et al. 2018, arXiv:1812.05905.
-`TQC` joins the losses to networks and optimisers; `HindsightTQC` updates them on relabelled batches of the
-replay. Nothing here is jitted: wrap the outermost function, such as a scan of updates, and donate the state.
+From top to bottom: settings, losses, critics, a prediction of arms in motion that critics may observe, and
+`TQC`, which joins them.
+
+`TQC` is usable alone, on transitions of any environment with actions in [-1, 1]:
+
+    agent = TQC(obs_size, action_size, TQCConfig(gamma=0.98))
+    state = agent.init(key)
+    action = agent.act(state, obs, key)                                # explores
+    state, metrics = jax.jit(agent.update)(state, Transition(obs, action, reward, next_obs, terminated), key)
+    action = agent.mode(agent.policy(state), obs)                      # does not explore
+
+`train.epoch.replay` has a replay for it: `create`, `add` and `sample`. Nothing here is jitted: wrap the
+outermost function, such as a scan of updates, and donate the state. `train.epoch.replay_epoch` does so.
 
 Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K kept target quantiles.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
 
 from mjx_softarm._support import draws
-from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.env import EnvConfig
+from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
 from train.agent import networks
-from train.agent.hindsight import HindsightConfig, relabel
-from train.agent.learner import (
-    Experience,
-    Learner,
-    ReplayConfig,
-    Sample,
-    Transition,
-    check_settings,
-)
-from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
-from train.agent.prediction import PredictiveCritics, Predictor
+from train.agent.hindsight import HindsightConfig
+from train.agent.learner import Transition, check_settings
+from train.epoch.replay_epoch import ReplayConfig
 
 Params = Any  # a flax parameter tree
+ERROR_UNIT = 0.2  # error of 1 in the predictor's units: some 36 mm, what an arm moves in half a second
+PREDICTION_WEIGHT = 10.0  # weight of the prediction's loss beside that of the critics
+COST_AHEAD = 40.0  # initial weight of a predicted error of 1, summed over the predictions
 
 
 @dataclass(frozen=True)
 class TQCConfig(ReplayConfig):
-    """Hyperparameters, by default stable-baselines3-contrib's. Raises ValueError naming a bad field."""
+    """Hyperparameters, by default stable-baselines3-contrib's. Raises ConfigError naming a bad field."""
 
     VARIABLE = ("learning_rate", "learning_rate_alpha", "gamma", "tau", "initial_alpha", "target_entropy")
     VARIABLE += ("reward_scale", *(f"hindsight.{name}" for name in HindsightConfig.VARIABLE))
@@ -48,7 +57,7 @@ class TQCConfig(ReplayConfig):
     n_quantiles: int = 25  # quantiles per critic
     n_drop_per_critic: int = 2  # largest pooled target quantiles dropped, per critic
     layer_norm: bool = False  # layer normalisation in the critics
-    n_ahead: int = 0  # held actions whose predicted errors the critics observe, in motion; see `prediction`
+    n_ahead: int = 0  # held actions whose predicted errors the critics observe, in motion; see `Predictor`
     learning_rate: float = 3e-4  # learning rate of actor and critics (Adam)
     learning_rate_end: float = 1.0  # share of the learning rate left at the end of a half-cosine decay
     learning_rate_alpha: float = 3e-4  # learning rate of the temperature; 0 holds it at initial_alpha
@@ -57,8 +66,6 @@ class TQCConfig(ReplayConfig):
     initial_alpha: float = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
-    hindsight: HindsightConfig = field(default_factory=HindsightConfig)
-    """relabelled goals, as shares of a batch; the rest keeps its own goals"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,10 +83,230 @@ class TQCConfig(ReplayConfig):
         check_settings("learner", self, required)
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ValueError where the learner cannot learn in an environment."""
+        """Raise ConfigError where the learner cannot learn in an environment."""
         super().check(env)
         seen = self.n_ahead == 0 or env.observation == "motion"
         check_settings("learner", self, {"n_ahead": (seen, "0 without env.observation 'motion'")})
+
+
+def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:
+    """Return the critics' loss: regression of every predicted quantile m on every target k.
+
+    With delta = target_k - quantile_m, clip = delta limited to [-1, 1], tau_m = (m + 1/2) / M, a pair costs
+    |tau_m - 1[delta < 0]| * Huber(delta), where Huber(delta) = clip * (delta - clip / 2) has the slope clip.
+    The loss () is the mean over B, K, C and M, as in stable-baselines3-contrib; the paper sums over M. First
+    derivatives are exact, second derivatives are zero.
+
+    Args:
+        quantiles (B, C, M): predictions.
+        targets (B, K): samples of the target distribution, constants here.
+
+    Source: Dabney et al. 2017, arXiv:1710.10044, eq. 10; Kuznetsov et al. 2020, section 3.
+    """
+    n_quantiles = quantiles.shape[-1]
+    tau = (jnp.arange(n_quantiles, dtype=quantiles.dtype)[None, None, None, :] + 0.5) / n_quantiles
+    fixed = jax.lax.stop_gradient(quantiles)  # (B, C, M)
+    delta = jax.lax.stop_gradient(targets)[:, :, None, None] - fixed[:, None, :, :]  # (B, K, C, M)
+    clip = jnp.clip(delta, -1.0, 1.0)  # (B, K, C, M)
+    slope = jnp.where(clip < 0.0, 1.0 - tau, tau) * clip  # (B, K, C, M)
+    loss = jnp.mean(slope * (delta - 0.5 * clip), axis=1)  # (B, C, M)
+    # One pass over the pairs gives loss and slope: a term of value zero has the slope as its derivative.
+    return jnp.mean(loss - jnp.mean(slope, axis=1) * (quantiles - fixed))
+
+
+def drop_largest(samples: Array, n_drop: int) -> Array:
+    """Return rows (B, N) without their `n_drop` largest entries, in their order: (B, N - n_drop)."""
+    # To find a few maxima and to close the gaps costs a fraction of sorting the row.
+    dropped = jnp.sort(jax.lax.top_k(samples, n_drop)[1], axis=-1)  # (B, n_drop) columns, ascending
+    n_kept_before = dropped - jnp.arange(n_drop)[None, :]  # (B, n_drop) kept columns left of each dropped one
+    kept = jnp.arange(samples.shape[-1] - n_drop)[None, :]  # (1, N - n_drop) index among the kept
+    n_skipped = jnp.sum(n_kept_before[:, None, :] <= kept[:, :, None], axis=-1)  # (B, N - n_drop)
+    return jnp.take_along_axis(samples, kept + n_skipped, axis=-1)
+
+
+def truncated_targets(
+    next_quantiles: Array,
+    next_log_prob: Array,
+    reward: Array,
+    terminated: Array,
+    alpha: Array,
+    *,
+    gamma: float,
+    n_drop_per_critic: int,
+) -> Array:
+    """Return samples (B, K) of the soft target distribution, without its largest against overestimation.
+
+    The C * M quantiles z of the target critics are pooled, and the C * n_drop_per_critic largest are dropped.
+    The K others become y = reward + gamma * (1 - terminated) * (z - alpha * next_log_prob), in no order.
+
+    Args:
+        next_quantiles (B, C, M): target critics at the next observation and the actor's action there.
+        next_log_prob (B,): log-density of that action.
+        reward (B,): scaled reward.
+        terminated (B,): 1 where no value follows, else 0.
+        alpha (): temperature.
+        gamma: discount factor.
+        n_drop_per_critic: quantiles dropped per critic.
+
+    Source: Kuznetsov et al. 2020, section 3 (target distribution).
+    """
+    pooled = jnp.reshape(next_quantiles, (next_quantiles.shape[0], -1))  # (B, C * M)
+    kept = drop_largest(pooled, next_quantiles.shape[1] * n_drop_per_critic)  # (B, K)
+    soft = kept - alpha * next_log_prob[:, None]  # (B, K)
+    return reward[:, None] + gamma * (1.0 - terminated)[:, None] * soft
+
+
+def actor_loss(log_prob: Array, quantiles: Array, alpha: Array) -> Array:
+    """Return the mean () of alpha * log_prob - Q over the actor's actions; Q is the mean of all quantiles.
+
+    Args:
+        log_prob (B,): log-density of the actions.
+        quantiles (B, C, M): critics at those actions.
+        alpha (): temperature.
+
+    Source: Kuznetsov et al. 2020, section 3 (policy loss).
+    """
+    return jnp.mean(alpha * log_prob - jnp.mean(quantiles, axis=(1, 2)))
+
+
+def alpha_loss(log_alpha: Array, log_prob: Array, target_entropy: float) -> Array:
+    """Return the mean () of -log_alpha * (log_prob + target_entropy); alpha rises while entropy is too low.
+
+    Args:
+        log_alpha (): log temperature.
+        log_prob (B,): log-density of the actor's actions, a constant here.
+        target_entropy: target entropy [nat].
+
+    Source: Haarnoja et al. 2018, arXiv:1812.05905, section 6; log_alpha in place of alpha, as in its code.
+    """
+    return -log_alpha * jnp.mean(jax.lax.stop_gradient(log_prob) + target_entropy)
+
+
+class Critics(nn.Module):
+    """An ensemble of independent quantile networks of (observation, action).
+
+    All critics read the same input, so their first layers are one matrix whose columns are split among them.
+    Deeper layers are a matrix per critic. No parameter is shared. On a CPU this is faster than a vmapped
+    ensemble, which transposes at every layer.
+
+    Attributes:
+        n_critics: number of critics C.
+        n_quantiles: quantiles per critic M.
+        hidden: width of each hidden layer of one critic, at least one.
+        layer_norm: normalise each hidden layer before its ReLU.
+    """
+
+    n_critics: int = 2
+    n_quantiles: int = 25
+    hidden: tuple[int, ...] = (256, 256)
+    layer_norm: bool = False
+
+    @nn.compact
+    def __call__(self, obs: Array, action: Array, ahead: Array | None = None) -> Array:
+        """Return the quantiles (..., C, M) of the return, unsorted, at obs (..., O) and action (..., A).
+
+        With errors (..., K, 6) that are predicted after the action, the quantiles fall with their norms.
+        """
+        inputs = [obs, action]
+        if ahead is not None:
+            norms = jnp.sqrt(jnp.sum(ahead**2, axis=-1) + 1e-8)  # (..., K)
+            inputs += [ahead.reshape(*ahead.shape[:-2], -1), norms]
+        x = jnp.concatenate(inputs, axis=-1)  # (..., O + A, and 7 K)
+        first = nn.Dense(self.n_critics * self.hidden[0], name="hidden_0")(x)  # (..., C * H_0)
+        quantiles = []
+        for c, x in enumerate(jnp.split(first, self.n_critics, axis=-1)):  # (..., H_0)
+            x = self._activate(x, f"critic_{c}_norm_0")
+            for i, width in enumerate(self.hidden[1:], start=1):
+                x = nn.Dense(width, name=f"critic_{c}_hidden_{i}")(x)  # (..., H_i)
+                x = self._activate(x, f"critic_{c}_norm_{i}")
+            quantiles.append(nn.Dense(self.n_quantiles, name=f"critic_{c}_head")(x))  # (..., M)
+            if ahead is not None:
+                initial = nn.initializers.constant(jnp.log(jnp.expm1(COST_AHEAD / norms.shape[-1])))
+                cost = nn.softplus(self.param(f"critic_{c}_cost", initial, norms.shape[-1:]))  # (K,)
+                quantiles[c] -= jnp.sum(cost * norms, axis=-1, keepdims=True)
+        return jnp.stack(quantiles, axis=-2)  # (..., C, M)
+
+    def _activate(self, x: Array, norm_name: str) -> Array:
+        return nn.relu(nn.LayerNorm(name=norm_name)(x) if self.layer_norm else x)
+
+
+class Predictor(nn.Module):
+    """ReLU network that predicts the change of a moving arm's observation by an action.
+
+    The goal does not enter, so transitions of all goals teach it.
+
+    Source: critics that observe a learned prediction, Fujimoto et al., "For SALE: State-Action Representation
+    Learning for Deep Reinforcement Learning", NeurIPS 2023.
+
+    Attributes:
+        hidden: width of each hidden layer.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+
+    @nn.compact
+    def __call__(self, obs: Array, action: Array) -> Array:
+        """Return the changes (..., O - 6 - A) of pose, error and what is sensed, without goal and action."""
+        x = jnp.concatenate([obs[..., POSE], obs[..., OBS_SIZE:], action], axis=-1)
+        for i, width in enumerate(self.hidden):
+            x = nn.relu(nn.Dense(width, name=f"hidden_{i}")(x))
+        n_sensed = obs.shape[-1] - OBS_SIZE - action.shape[-1]
+        small = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")  # no change, at first
+        return nn.Dense(12 + n_sensed, kernel_init=small, name="head")(x)
+
+
+class PredictiveCritics:
+    """Quantile critics that observe the errors predicted for an action that is held.
+
+    It takes the place of `Critics`. The critics' loss does not teach the predictor; `loss` does. The
+    quantiles fall in proportion to the norms of the predicted errors.
+
+    Source: critics that fall with a distance to the goal, Liu et al., "Metric Residual Networks for Sample
+    Efficient Goal-Conditioned Reinforcement Learning", AAAI 2023.
+
+    Args:
+        critics: networks of the quantiles.
+        predictor: network of the prediction.
+        n_ahead: number of actions that are predicted.
+    """
+
+    def __init__(self, critics: Critics, predictor: Predictor, n_ahead: int):
+        self.critics: Any = critics  # flax does not type what a module returns
+        self.predictor: Any = predictor
+        self.n_ahead = n_ahead
+
+    def init(self, key: Array, obs: Array, action: Array) -> dict[str, Params]:
+        """Return fresh parameters for observations (B, O) and actions (B, A)."""
+        keys = jax.random.split(key)
+        ahead = jnp.zeros((*obs.shape[:-1], self.n_ahead, 6))
+        return {
+            "critics": self.critics.init(keys[0], obs, action, ahead),
+            "predictor": self.predictor.init(keys[1], obs, action),
+        }
+
+    def apply(self, params: dict[str, Params], obs: Array, action: Array) -> Array:
+        """Return the quantiles (..., C, M) of the return at obs (..., O) and action (..., A)."""
+        predictor, later, ahead = jax.lax.stop_gradient(params["predictor"]), obs, []
+        for _ in range(self.n_ahead):
+            later = self.after(predictor, later, action)
+            ahead.append(later[..., ERROR])
+        return self.critics.apply(params["critics"], obs, action, jnp.stack(ahead, axis=-2))
+
+    @functools.partial(jax.jit, static_argnums=0)  # traced once for all that look ahead
+    def after(self, predictor: Params, obs: Array, action: Array) -> Array:
+        """Return the observation (..., O) that is predicted after an action (..., A)."""
+        change = self.predictor.apply(predictor, obs, action)
+        pose, error, sensed = jnp.split(change, (6, 12), axis=-1)
+        next_pose = obs[..., POSE] + pose
+        next_error = obs[..., ERROR] + ERROR_UNIT * error
+        next_sensed = obs[..., OBS_SIZE : -action.shape[-1]] + sensed
+        return jnp.concatenate([next_pose, obs[..., GOAL], next_error, next_sensed, action], axis=-1)
+
+    def loss(self, params: dict[str, Params], obs: Array, action: Array, next_obs: Array) -> Array:
+        """Return the prediction's loss (): a square up to one unit, then linear, for angles that wrap."""
+        off = self.after(params["predictor"], obs, action) - next_obs
+        off = off.at[..., ERROR].divide(ERROR_UNIT)
+        return PREDICTION_WEIGHT * 2.0 * jnp.mean(optax.huber_loss(off))
 
 
 class TQCState(NamedTuple):
@@ -106,7 +333,7 @@ class TQC:
     def __init__(self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig()) -> None:
         self.obs_size, self.action_size, self.config = obs_size, action_size, config
         self.actor: Any = networks.Actor(action_size, config.hidden, config.activation)
-        self.critics: Any = networks.Critics(
+        self.critics: Any = Critics(
             config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
         )
         if config.n_ahead:
@@ -167,7 +394,8 @@ class TQC:
         All three gradients are taken at the incoming state, so none waits for another's optimiser.
 
         Returns:
-            The next state, and scalar metrics: the losses, alpha, entropy [nat], q_mean, target_mean.
+            The next state, and scalar metrics named `tqc/...`: the losses, alpha, entropy [nat], means of
+            the quantiles and of the targets.
 
         Raises:
             ValueError: a field of `batch` has the wrong shape.
@@ -198,9 +426,10 @@ class TQC:
             critic_opt_state=critic[1],
             alpha_opt_state=temperature[1],
         )
-        losses = {"actor_loss": loss_actor, "alpha_loss": loss_alpha, **critic_metrics}
-        means = {"entropy": -jnp.mean(log_prob), "target_mean": jnp.mean(targets)}
-        return next_state, {**losses, **means, "alpha": jnp.exp(state.log_alpha)}
+        metrics = {"actor_loss": loss_actor, "alpha_loss": loss_alpha, **critic_metrics}
+        metrics |= {"entropy": -jnp.mean(log_prob), "target_mean": jnp.mean(targets)}
+        metrics["alpha"] = jnp.exp(state.log_alpha)
+        return next_state, {f"tqc/{name}": x for name, x in metrics.items()}
 
     def _targets(self, state: TQCState, batch: Transition, noise: Array) -> Array:
         next_actor = self.actor.apply(state.actor_params, batch.next_obs)
@@ -228,36 +457,3 @@ class TQC:
         action, log_prob = networks.squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
         quantiles = self.critics.apply(state.critic_params, obs, action)  # (B, C, M)
         return actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha)), log_prob
-
-
-class HindsightTQC(Learner):
-    """`Learner` whose update has two parts, between which a wrapper can change the batch."""
-
-    def __init__(self, config: TQCConfig, env: ReachEnv):
-        self.config, self.env = config, env
-        self.tqc = tqc = TQC(env.observation_size, env.action_size, config)
-        self.init, self.act, self.policy, self.mode = tqc.init, tqc.act, tqc.policy, tqc.mode
-        self.parts, self.adopt = tqc.parts, tqc.adopt
-
-    def update(self, state: TQCState, sample: Sample, key: Array) -> tuple[TQCState, dict[str, Array]]:
-        """Take one gradient step of all networks on one relabelled batch."""
-        key_sample, key_relabel, key_update = jax.random.split(key, 3)
-        batch, _ = self.transitions(sample(key_sample, self.config.hindsight.n_later), key_relabel)
-        return self.learn(state, batch, key_update)
-
-    def transitions(self, stored: Experience, key: Array) -> tuple[Transition, Array]:
-        """Relabel a batch of B stored transitions; also return which of them (B,) have another goal."""
-        return relabel(
-            stored,
-            key,
-            self.config.hindsight,
-            self.env.scale,
-            self.env.config.reward,
-            goal_ends=self.env.config.goal_ends,
-            senses_action=self.env.config.observation == "motion",
-        )
-
-    def learn(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
-        """Take one gradient step on a batch; the metrics are those of `TQC.update`."""
-        state, metrics = self.tqc.update(state, batch, key)
-        return state, {f"tqc/{name}": x for name, x in metrics.items()}

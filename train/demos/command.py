@@ -50,15 +50,14 @@ class Record(ArmOptions):
         expert = Expert(spec, s2r, pipe)
         plan = expert.plan(waypoints)
         # Record, and report the poses and errors.
-        tell, save = partial(_tell, console), partial(save_log, self.out)
-        recorder = WaypointRecorder(arm, expert, tell, save)
+        recorder = WaypointRecorder(arm, expert, partial(_print, console), partial(save_log, self.out))
         result = recorder.record(waypoints, plan)
         if len(result.log) and result.ending.status != NOT_WRITTEN:
-            _tell(console, f"demonstrations: {self.out}, {len(result.log)} poses")
+            _print(console, f"demonstrations: {self.out}, {len(result.log)} poses")
             if np.isfinite(result.off_m).any():
-                _tell(console, f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
+                _print(console, f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
         if result.ending.cause:
-            _tell(console, f"ended early: {result.ending.cause}")
+            _print(console, f"ended early: {result.ending.cause}")
         return result.ending.status or (DONE if len(result.log) else MISSED)
 
 
@@ -74,11 +73,11 @@ class Check(ArmOptions):
         spec = self.read_arm(console).spec
         log, findings = read_demonstrations(self.file, spec)
         for text in (*_summary(log, spec), *map(str, findings)):
-            _tell(console, text)
+            _print(console, text)
         return 0
 
 
-def _tell(console: Console, text: str) -> None:
+def _print(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 

@@ -74,11 +74,11 @@ class Expert:
         Raises:
             ExpertError: a waypoint cannot be met.
         """
-        found, before = [], np.zeros(self.spec.n_chambers)
+        postures, before = [], np.zeros(self.spec.n_chambers)
         for waypoint in waypoints:
-            found.append(self.reach(waypoint.name, self.target(waypoint), before))
-            before = found[-1].pressure_kpa
-        return jax.tree.map(lambda *x: np.stack(x), *found)
+            postures.append(self.reach(waypoint.name, self.target(waypoint), before))
+            before = postures[-1].pressure_kpa
+        return jax.tree.map(lambda *x: np.stack(x), *postures)
 
     def target(self, waypoint: Waypoint) -> PostureTarget:
         """Return the target of a waypoint, for the arm as simulated."""
@@ -96,19 +96,19 @@ class Expert:
         # Solve from all starts. If no solution meets the target, ease the orientation and solve again.
         for weight in (1.0, EASED) if target.turn.any() else (1.0,):
             eased = target._replace(turn=np.float32(weight) * target.turn)
-            found = self.look(np.asarray(self._solve(starts, eased)))
-            slack = self._slack(found, eased)
+            postures = self.look(np.asarray(self._solve(starts, eased)))
+            slack = self._slack(postures, eased)
             met = np.flatnonzero((slack >= 0.0).all(axis=-1))
             if len(met):
                 break
         else:
-            raise ExpertError(self._why(name, target, found, slack))
+            raise ExpertError(self._why(name, target, postures, slack))
         # Of the solutions, take those with the clearest path, and of these the nearest.
-        way = [found.pressure_kpa[met] * share + before_kpa * (1.0 - share) for share in WAY]
+        way = [postures.pressure_kpa[met] * share + before_kpa * (1.0 - share) for share in WAY]
         clear_m = self.look(np.concatenate(way)).clearance_m.reshape(len(WAY), -1).min(axis=0)
-        far_kpa = np.linalg.norm(found.pressure_kpa[met] - before_kpa, axis=-1)
+        far_kpa = np.linalg.norm(postures.pressure_kpa[met] - before_kpa, axis=-1)
         best = met[np.lexsort([far_kpa, -np.minimum(clear_m, WAY_CLEAR_M)])[0]]
-        return jax.tree.map(lambda x: x[best], found)
+        return jax.tree.map(lambda x: x[best], postures)
 
     def _starts(self, target: PostureTarget) -> np.ndarray:
         """Return pressures (N_STARTS, n_chambers): around the previous posture, and from the pool."""
@@ -125,40 +125,41 @@ class Expert:
         chambers = self.spec.chambers
         return chambers.pressure_min_kpa, chambers.pressure_max_kpa
 
-    def _room_kpa(self, found: Posture, target: PostureTarget) -> np.ndarray:
+    def _room_kpa(self, postures: Posture, target: PostureTarget) -> np.ndarray:
         """Return the distance (n, n_chambers) of the real arm's pressures to the nearest limit."""
-        (low, high), real_kpa = self._limits_kpa(), found.pressure_kpa + target.bias_kpa
+        (low, high), real_kpa = self._limits_kpa(), postures.pressure_kpa + target.bias_kpa
         return np.minimum(real_kpa - low, high - real_kpa)
 
-    def _slack(self, found: Posture, target: PostureTarget | None = None) -> np.ndarray:
+    def _slack(self, postures: Posture, target: PostureTarget | None = None) -> np.ndarray:
         """Return the slack (n, demands) of each demand, in units of its tolerance.
 
         Demands are equilibrium and clearance and, with a target, pressures, springs, position, orientation.
         """
         springs = self.spec.springs
         shortest, longest = map(self.spec.at_springs, (springs.length_min_m, springs.length_max_m))
-        margin_m = np.minimum(found.spring_m - shortest, longest - found.spring_m)
-        demands = [1.0 - found.residual / RESIDUAL_TOLERANCE, found.clearance_m / MARGIN_M - LIMIT_SHARE]
+        margin_m = np.minimum(postures.spring_m - shortest, longest - postures.spring_m)
+        clearance = postures.clearance_m / MARGIN_M - LIMIT_SHARE
+        demands = [1.0 - postures.residual / RESIDUAL_TOLERANCE, clearance]
         if target is not None:
-            off_m, turn_rad = _off(found, target)
+            off_m, turn_rad = _off(postures, target)
             demands += [
-                self._room_kpa(found, target).min(axis=-1) / MARGIN_KPA - LIMIT_SHARE,
+                self._room_kpa(postures, target).min(axis=-1) / MARGIN_KPA - LIMIT_SHARE,
                 margin_m.min(axis=-1) / SPRING_MARGIN_M - LIMIT_SHARE,
                 1.0 - off_m / TOLERANCE_M,
                 1.0 - turn_rad / TOLERANCE_RAD,
             ]
         return np.nan_to_num(np.stack(demands, axis=-1), nan=-np.inf)
 
-    def _why(self, name: str, target: PostureTarget, found: Posture, slack: np.ndarray) -> str:
+    def _why(self, name: str, target: PostureTarget, postures: Posture, slack: np.ndarray) -> str:
         """Return the text of an error: errors, clearance and tightest chamber of the best solution."""
         best = int(np.argmax(np.minimum(slack, 0.0).sum(axis=-1)))
-        off_m, turn_rad = (value[best] for value in _off(found, target))
+        off_m, turn_rad = (value[best] for value in _off(postures, target))
         low, high = self._limits_kpa()
-        chamber = int(np.argmin(self._room_kpa(found, target)[best]))
-        kpa = (found.pressure_kpa[best] + target.bias_kpa)[chamber]
+        chamber = int(np.argmin(self._room_kpa(postures, target)[best]))
+        kpa = (postures.pressure_kpa[best] + target.bias_kpa)[chamber]
         finger = ", ".join(f"{1e3 * value:.0f}" for value in target.finger_m)
         turned = f" and turned by {np.degrees(turn_rad):.1f} deg" if target.turn.any() else ""
-        wall = "" if self.pipe is None else f", {1e3 * found.clearance_m[best]:.1f} mm from the wall"
+        wall = "" if self.pipe is None else f", {1e3 * postures.clearance_m[best]:.1f} mm from the wall"
         expected = f", {np.degrees(TOLERANCE_RAD / EASED):.1f} deg" if target.turn.any() else ""
         expected += "" if self.pipe is None else f", {1e3 * MARGIN_M:g} mm from the wall"
         return (
@@ -168,7 +169,7 @@ class Expert:
         )
 
 
-def _off(found: Posture, target: PostureTarget) -> tuple[np.ndarray, np.ndarray]:
+def _off(postures: Posture, target: PostureTarget) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the finger tips (n,) [m] and of the gripper's orientation (n,) [rad]."""
-    angle = target.turn * angle_between(found.rotation, target.rotation)
-    return np.linalg.norm(found.finger_m - target.finger_m, axis=-1), np.linalg.norm(angle, axis=-1)
+    angle = target.turn * angle_between(postures.rotation, target.rotation)
+    return np.linalg.norm(postures.finger_m - target.finger_m, axis=-1), np.linalg.norm(angle, axis=-1)

@@ -55,23 +55,23 @@ class PostureTarget(NamedTuple):
 def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
     """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        found = settle_pressures(params.without_pressure_limits(), pressure_kpa)
-        frames = chain_kinematics(params)(found.q)
+        settled = settle_pressures(params.without_pressure_limits(), pressure_kpa)
+        frames = chain_kinematics(params)(settled.q)
         plates = frames.plate_position, frames.plate_rotation
         pose = pose_from_frame(frames.tip_position, frames.tip_rotation)
         if s2r is not None:
-            pose = correct(s2r, pose, found.spring_m)
+            pose = correct(s2r, pose, settled.spring_m)
             plates = carry_body(*plates, pose)
         position_m, rotation = frame_from_pose(pose)
     wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else clearance(pipe, body_points(*plates, spec))
     return Posture(
         pressure_kpa=pressure_kpa,
-        spring_m=found.spring_m,
+        spring_m=settled.spring_m,
         pose=pose,
         finger_m=position_m - spec.mass.gripper_length_m * rotation[:, 2],
         rotation=rotation,
         clearance_m=jnp.min(wall_m),
-        residual=found.residual,
+        residual=settled.residual,
     ), wall_m
 
 

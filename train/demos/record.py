@@ -44,7 +44,7 @@ class WaypointRecorder:
     Args:
         arm: the arm, with or without motion capture.
         expert: expert for the arm.
-        tell: takes a line for each pose.
+        report: takes a line for each pose.
         save: writes the log, if it has rows, once the arm is vented.
     """
 
@@ -52,10 +52,10 @@ class WaypointRecorder:
         self,
         arm: ArmIO,
         expert: Expert,
-        tell: Callable[[str], None] = lambda text: None,
+        report: Callable[[str], None] = lambda text: None,
         save: Callable[[Log], None] = lambda log: None,
     ):
-        self.expert, self.tell, self._save = expert, tell, save
+        self.expert, self.report, self._save = expert, report, save
         self._drive = Drive(arm, expert.spec, self._tick)
         self._rows, self._off_m = Recorder(), []
         self._readings = np.empty(0)  # (n_springs,) of the newest tick
@@ -75,10 +75,10 @@ class WaypointRecorder:
                 self._rows.add(row | {"sequence": sequence})
                 self._off_m.append(off_m)
                 seen = f"{1e3 * off_m:.1f} mm off" if np.isfinite(off_m) else "not seen"
-                self.tell(f"{len(self._rows)} of {len(waypoints)}: {waypoint.name}: {seen}")
+                self.report(f"{len(self._rows)} of {len(waypoints)}: {waypoint.name}: {seen}")
 
         ending = vent_at_end(
-            run, self._drive.link, self.tell, lambda: self._save(self._log()) if self._rows else None
+            run, self._drive.link, self.report, lambda: self._save(self._log()) if self._rows else None
         )
         return RecordedPoses(self._log(), np.array(self._off_m), ending)
 
@@ -105,7 +105,7 @@ class WaypointRecorder:
             try:
                 posture = self.expert.reach(waypoint.name, asked, posture.pressure_kpa)
             except ExpertError as error:
-                self.tell(f"not corrected: {error}")
+                self.report(f"not corrected: {error}")
                 break
         # Refuse a waypoint without rest, or a pose far from it.
         if best is None:

@@ -76,6 +76,6 @@ def pick_and_place(pipe: CrossPipe, stops: Sequence[tuple[str, int]]) -> tuple[W
 def _along(corner_m: np.ndarray, n: int) -> np.ndarray:
     """Return points (n, 3) evenly spaced along a path with corners (k, 3), without its first point."""
     length_m = np.linalg.norm(np.diff(corner_m, axis=0), axis=1)
-    at = np.concatenate([[0.0], np.cumsum(length_m)])
-    where = at[-1] * np.arange(1, n + 1) / n
-    return np.stack([np.interp(where, at, corner_m[:, k]) for k in range(3)], axis=-1)
+    distance_m = np.concatenate([[0.0], np.cumsum(length_m)])
+    stop_m = distance_m[-1] * np.arange(1, n + 1) / n
+    return np.stack([np.interp(stop_m, distance_m, corner_m[:, k]) for k in range(3)], axis=-1)

@@ -11,6 +11,7 @@ checkpoints to one folder; the first process alone writes all else.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from train.config import ConfigError
+from train.agent.learner import ConfigError
 
 AXIS = "devices"
 CLUSTER = "cluster"
@@ -45,12 +46,13 @@ def mesh_of(devices: str | None) -> Mesh | None:
         return None
     # Devices of this process.
     if devices.isdecimal() and int(devices):
-        n, found = int(devices), jax.local_devices()
-        if len(found) < n:
+        n = int(devices)
+        local = jax.local_devices()
+        if len(local) < n:
             on_cpu = jax.default_backend() == "cpu"
             hint = "; the environment variable JAX_NUM_CPU_DEVICES makes more of a CPU" * on_cpu
-            raise ConfigError(f"--devices: got {n}, expected at most {len(found)}, which there are{hint}")
-        return Mesh(np.array(found[:n]), (AXIS,))
+            raise ConfigError(f"--devices: got {n}, expected at most {len(local)}, which there are{hint}")
+        return Mesh(np.array(local[:n]), (AXIS,))
     # Devices of several processes, which meet at an address or by the cluster's own means.
     meeting = _MEETING.fullmatch(devices)
     if not meeting and devices != CLUSTER:
@@ -64,6 +66,15 @@ def mesh_of(devices: str | None) -> Mesh | None:
     except (ValueError, RuntimeError) as error:
         raise ConfigError(f"--devices: got {devices} ({error}), expected processes that meet") from error
     return Mesh(np.array(jax.devices()), (AXIS,))
+
+
+def check_split(config: Any, names: Sequence[str], mesh: Mesh) -> None:
+    """Raise ConfigError where one of some numbers of a learner cannot be split evenly over the devices."""
+    for name in names:
+        if getattr(config, name) % mesh.size:
+            raise ConfigError(
+                f"learner.{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
+            )
 
 
 def split(mesh: Mesh) -> NamedSharding:

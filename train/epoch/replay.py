@@ -109,9 +109,9 @@ def sample_ahead(
     key_slot, key_ahead = jax.random.split(key)
     slot = draws.integers(key_slot, batch_size, replay.size).astype(jnp.int32)
     ahead = draws.integers(key_ahead, batch_size, jnp.asarray(n_ahead + 1)).astype(jnp.int32)
-    after = (slot + ahead * stride) % _capacity(replay)
+    later_slot = (slot + ahead * stride) % _capacity(replay)
     items = jax.tree.map(lambda ring: ring[slot], replay.data)
-    later = jax.tree.map(lambda ring: ring[after], replay.data)
+    later = jax.tree.map(lambda ring: ring[later_slot], replay.data)
     return items, later, ahead
 
 

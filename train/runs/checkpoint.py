@@ -5,13 +5,12 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import jax
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.lazy import LazyModule
-from train.epoch.state import TrainState
 
 if TYPE_CHECKING:
     import orbax.checkpoint as ocp
@@ -53,20 +52,20 @@ class Checkpoints:
         for later in [saved for saved in self.epochs if saved > epoch]:
             self._manager.delete(later)
 
-    def save(self, epoch: int, state: TrainState, parts: dict[str, Any]) -> None:
+    def save(self, epoch: int, state: Any, parts: dict[str, Any]) -> None:
         """Write a checkpoint; an interrupted write leaves the one before it in force.
 
         Args:
             epoch: number of epochs done.
             state: all that the run needs to go on.
-            parts: what export and other runs need of the learner; see `Learner.parts`.
+            parts: what export and other runs need of the learner; see `train.epoch.replay_epoch.Learner`.
         """
         both = {"state": state, "parts": jax.device_get(parts)}
         saved = {name: ocp.args.StandardSave(item) for name, item in both.items()}
         self._manager.save(epoch, args=ocp.args.Composite(**saved))
         self._manager.wait_until_finished()
 
-    def restore(self, like: TrainState) -> tuple[int, TrainState]:
+    def restore(self, like: Any) -> tuple[int, Any]:
         """Return the newest checkpoint: epochs done, and state.
 
         Args:
@@ -76,8 +75,7 @@ class Checkpoints:
             RunError: there is no checkpoint, or it has another structure.
         """
         shapes = ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like))
-        epoch, state = self._newest("state", shapes)
-        return epoch, cast(TrainState, state)
+        return self._newest("state", shapes)
 
     def parts(self) -> dict[str, Any]:
         """Return the newest checkpoint's parts of the learner as NumPy arrays; see `Learner.parts`.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self, cast
@@ -25,8 +25,7 @@ from train.options import NewRunOptions, ReachOptions, named, start
 from train.presets import IMITATION_PRESETS
 from train.runs import run as runs
 from train.runs.evaluate import N_ACTIONS
-from train.runs.folder import Run
-from train.runs.lock import sole_trainer
+from train.runs.folder import Run, sole_trainer
 from train.runs.task import Task, task_of
 
 Devices = Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="D", help=devices.HELP)]
@@ -47,21 +46,7 @@ class Reach(ReachOptions):
         if self.resume:
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
-        agent = Run.open(self.agent) if self.agent else None
-        config = self.config.with_policy_of(agent.config) if agent else self.config
-        arm = self.read_arm(console)
-        console.print("drawing goals from the reachable workspace ...")
-        env = ReachEnv(arm.spec, config.env, arm.s2r)
-        if env.spec != arm.spec:
-            own, given = (spec.structure.links_per_section for spec in (env.spec, arm.spec))
-            console.print(f"the arm has {own} links per section in this run, {given} in its specification")
-        task = task_of(config, env, mesh=mesh)
-        path = self.out or runs.default_path("reach", self.preset, config.seed)
-        donors = {"agent": agent} if agent else {}
-        first = runs.begin_with(task, config.seed, donors) if agent else None
-        begins_with = {name: donor.path for name, donor in donors.items()}
-        run = Run.create(path, config, arm, None, begins_with, first, self.preset)
-        return _train(run, task, console)
+        return _begin("reach", self, self.config, {"agent": self.agent}, mesh, console)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,20 +92,8 @@ class Imitate(NewRunOptions):
                 f"learner.learned_weight: got 0 with --reward {self.reward}, expected more, for its reward"
             )
         config = dataclasses.replace(self.config, learner=learner)
-        # The arm, the demonstrations, and the runs that the new one begins with.
-        arm = self.read_arm(console)
-        log, _ = read_demonstrations(self.file, arm.spec)
-        donors = {name: path for name in ("agent", "reward") if (path := getattr(self, name))}
-        opened = {name: Run.open(path) for name, path in donors.items()}
-        if "agent" in opened:
-            config = config.with_policy_of(opened["agent"].config)
-        # The first state, and the run.
-        env = ReachEnv(arm.spec, config.env, arm.s2r)
-        task = task_of(config, env, from_log(log, arm.spec), mesh)
-        first = runs.begin_with(task, config.seed, opened)
-        path = self.out or runs.default_path("imitate", self.preset, config.seed)
-        run = Run.create(path, config, arm, log, donors, first, self.preset)
-        return _train(run, task, console)
+        donors = {"agent": self.agent, "reward": self.reward}
+        return _begin("imitate", self, config, donors, mesh, console, self.file)
 
 
 def evaluate(
@@ -170,7 +143,7 @@ def evaluate(
     # Evaluate under them.
     spec = opened.spec.replace(mass={"payload_kg": opened.spec.mass.payload_kg + 1e-3 * payload})
     summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.arm.s2r), n_actions)(policy)
-    _table(f"{task.title}, {how}", summary, console)
+    _table(f"{task.evaluate.title}, {how}", summary, console)
     file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())
     console.print(f"written: {file}", highlight=False, soft_wrap=True)
@@ -182,6 +155,46 @@ def _mesh(text: str | None, console: Console) -> Mesh | None:
     mesh = devices.mesh_of(text)
     console.quiet = not devices.is_first_process()
     return mesh
+
+
+def _begin(
+    command: str,
+    options: Reach | Imitate,
+    config: TrainConfig,
+    donors: Mapping[str, Path | None],
+    mesh: Mesh | None,
+    console: Console,
+    demonstrations: Path | None = None,
+) -> int:
+    """Make a run and train it to its end; returns the exit status.
+
+    Args:
+        command: name of the command.
+        options: its options.
+        config: settings of the run.
+        donors: folders of runs that the new one takes parts of, `agent` and `reward`.
+        mesh: devices, if there are several.
+        console: shows progress.
+        demonstrations: file of demonstrations, if it learns from these.
+    """
+    # The arm, the demonstrations, and the runs that the new one begins with.
+    arm = options.read_arm(console)
+    log = None if demonstrations is None else read_demonstrations(demonstrations, arm.spec)[0]
+    opened = {name: Run.open(path) for name, path in donors.items() if path}
+    if "agent" in opened:
+        config = config.with_policy_of(opened["agent"].config)
+    # The task, the first state, and the run.
+    console.print("drawing goals from the reachable workspace ...")
+    env = ReachEnv(arm.spec, config.env, arm.s2r)
+    if env.spec != arm.spec:
+        n, n_specified = (spec.structure.links_per_section for spec in (env.spec, arm.spec))
+        console.print(f"the arm has {n} links per section in this run, {n_specified} in its specification")
+    task = task_of(config, env, None if log is None else from_log(log, arm.spec), mesh)
+    first = runs.begin_with(task, config.seed, opened) if opened else None
+    path = options.out or runs.default_path(command, options.preset, config.seed)
+    begins_with = {name: run.path for name, run in opened.items()}
+    run = Run.create(path, config, arm, log, begins_with, first, options.preset)
+    return _train(run, task, console)
 
 
 def _resume(path: Path, mesh: Mesh | None, console: Console) -> int:
@@ -205,7 +218,7 @@ def _train(run: Run, task: Task, console: Console) -> int:
 
 
 def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
-    _table(f"{task.title}, {N_ACTIONS} actions each", summary, console)
+    _table(f"{task.evaluate.title}, {N_ACTIONS} actions each", summary, console)
     for picture in sorted(run.path.glob("*.png")):
         console.print(f"picture: {picture}", highlight=False, soft_wrap=True)
 

@@ -24,7 +24,6 @@ from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
-from train.agent.learner import Learner
 
 N_GOALS = 2_000
 NEAR_MM = 5.0  # tip error of an arm that has arrived, in motion
@@ -109,7 +108,7 @@ class Evaluator:
     def __init__(
         self,
         env: ReachEnv,
-        learner: Learner,
+        learner: Any,
         n_goals: int = N_GOALS,
         n_actions: int = N_ACTIONS,
         shift_limit: np.ndarray = UNCORRECTED,
@@ -118,6 +117,15 @@ class Evaluator:
         self.circle = np.asarray(circle_poses(env.spec))
         go = follower(self.env, learner, n_actions, shift_limit)
         self._follow = xla.jit(jax.vmap(go, in_axes=(None, 0, 0)))
+
+    @property
+    def title(self) -> str:
+        """Title of the table of figures."""
+        return f"{self.n_goals} held-out goals"
+
+    def headline(self, row: dict[str, float]) -> str:
+        """Return a short text for a row of metrics with an evaluation."""
+        return f"held-out median {row['evaluation/median_mm']:.1f} mm"
 
     @functools.cached_property
     def goals(self) -> np.ndarray:
@@ -137,11 +145,11 @@ class Evaluator:
         policy = jax.device_get(policy)
         lap, n_goals = len(self.circle), len(self.goals)
         paths = np.concatenate([paths_of(self.goals), np.tile(self.circle, (2, 1))[None]])
-        found = jax.device_get(self._follow(policy, paths, start_keys(len(paths))))
+        results = jax.device_get(self._follow(policy, paths, start_keys(len(paths))))
         # Split the results into the sets of goals and the circle.
-        both = jax.tree.map(lambda x: np.split(x[:-1].reshape(-1, *x.shape[2:])[:n_goals], 2), found)
+        both = jax.tree.map(lambda x: np.split(x[:-1].reshape(-1, *x.shape[2:])[:n_goals], 2), results)
         workspace, even = (Reached(*(field[k] for field in both)) for k in range(2))
-        circle = jax.tree.map(lambda x: x[-1, lap:], found)
+        circle = jax.tree.map(lambda x: x[-1, lap:], results)
         return summarise(workspace, even, circle, self.env.config.reward.threshold), workspace, circle
 
 
@@ -177,7 +185,7 @@ def towards(env: ReachEnv, state: State, goal: Array) -> State:
 
 def reach(
     env: ReachEnv,
-    learner: Learner,
+    learner: Any,
     policy: Any,
     state: State,
     goal: Array,
@@ -194,10 +202,10 @@ def reach(
         after = env.step(state, learner.mode(policy, state.obs))
         left = rewards.asked_error(after.pipeline_state.pose, goal, env.config.reward)
         shift = jnp.clip(shift - left, -shift_limit, shift_limit)
-        told = {name: after.info.get(name, ()) for name in ("valid", "clearance_mm", "path_mm")}
-        return (towards(env, after, goal + shift), shift), told
+        seen = {name: after.info.get(name, ()) for name in ("valid", "clearance_mm", "path_mm")}
+        return (towards(env, after, goal + shift), shift), seen
 
-    # Act, and find what the whole way tells.
+    # Act, and derive the figures of the whole way.
     begin = towards(env, state, goal), jnp.zeros(6)
     (state, _), way = jax.lax.scan(act, begin, None, length=n_actions)
     arm = state.pipeline_state
@@ -237,7 +245,7 @@ def way_figures(way_mm: Array, goal_mm: Array, period_s: float) -> tuple[Array, 
 
 def follow(
     env: ReachEnv,
-    learner: Learner,
+    learner: Any,
     policy: Any,
     path: Array,
     state: State,
@@ -253,7 +261,7 @@ def follow(
 
 
 def follower(
-    env: ReachEnv, learner: Learner, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
+    env: ReachEnv, learner: Any, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
 ) -> Callable[[Any, Array, Array], Reached]:
     """Return the function of policy, path and key that follows a path from a random start."""
     return lambda policy, path, key: follow(

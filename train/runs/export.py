@@ -90,11 +90,11 @@ def export(
     others = {"--out": out, "--onnx": onnx, "--cpp": cpp, "--calibration": calibration}
     if weights and (given := [name for name, value in others.items() if value]):
         raise RunError(f"--weights: got {' and '.join(given)} too, expected it alone")
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
     if not weights:
         n_enough = sum(_export(path, out, onnx, cpp, calibration, console) for path in folders)
         return 0 if n_enough == len(folders) else 1
-    (folder,) = folders
+    folder = next(iter(folders))
     entries = actor_entries(Run.open(folder))
     write_sealed(weights, entries, WEIGHTS)
     layers = [entries[f"actor.{k}.weight"] for k in range(int(entries["actor.n_layers"]))]
@@ -109,7 +109,7 @@ def _export(
     from mjx_softarm.export.write import export_cpp, export_onnx
     from train.options import ArmOptions, start
     from train.runs.arm_model import N_STEPS, arm_model
-    from train.runs.renew import renewed, told_enough
+    from train.runs.renew import policy_still_accurate, renewed
 
     start()
     run, file, keeps, enough = Run.open(path), out, path, True
@@ -117,7 +117,7 @@ def _export(
     # A later calibration takes the place of the run's
     if calibration:
         later = renewed(run, ArmOptions(calibration=calibration).read_arm(console))
-        enough = told_enough(run, later, calibration, console)
+        enough = policy_still_accurate(run, later, calibration, console)
         run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
     # Distil the arm's networks, unless they are kept
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()

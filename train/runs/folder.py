@@ -1,9 +1,12 @@
-"""A run's folder: its config with versions and commit, its checkpoints, its results."""
+"""A run's folder: its config with versions and commit, its checkpoints, its results; and its lock."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +20,14 @@ from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
-from train.agent.registry import LEARNERS, name_of
+from train.agent.registry import learns_from_demonstrations
 from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
 from train.epoch.devices import is_first_process
-from train.epoch.state import TrainState
 from train.runs.checkpoint import Checkpoints, RunError
 
 CONFIG_FILE, EVALUATION_FILE, METRICS_FILE = "config.json", "evaluation.json", "metrics.jsonl"
-DEMONSTRATIONS_FILE = "demonstrations.npz"
+DEMONSTRATIONS_FILE, LOCK_FILE = "demonstrations.npz", "training.lock"
 
 
 class Run:
@@ -58,7 +60,7 @@ class Run:
         arm: CalibratedArm,
         demonstrations: Log | None = None,
         begins_with: dict[str, Path] | None = None,
-        first: tuple[TrainState, dict[str, Any]] | None = None,
+        first: tuple[Any, dict[str, Any]] | None = None,
         preset: str | None = None,
     ) -> Run:
         """Start a folder.
@@ -143,7 +145,7 @@ class Run:
         Raises:
             RunError: its file cannot be read.
         """
-        if not LEARNERS[name_of(self.config.learner)].from_demonstrations:
+        if not learns_from_demonstrations(self.config.learner):
             return None
         try:
             return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
@@ -188,12 +190,12 @@ class Run:
         return read_json_lines(self.path / METRICS_FILE)
 
     def write_poses(self, *results: Any) -> None:
-        """Write poses at goals, and around the circle if an evaluation found them, for the view."""
+        """Write poses at goals, and around the circle if they were evaluated, for the view."""
         if is_first_process():
-            found = [getattr(result, "reached", result) for result in results]
+            reached = [getattr(result, "reached", result) for result in results]
             sets = {
                 name: PosePairs(at.goal, at.pose, (at.saturated_chambers > 0) | ~at.settled)
-                for name, at in zip(("goals", "circle"), found, strict=False)
+                for name, at in zip(("goals", "circle"), reached, strict=False)
             }
             write_pose_pairs(self.path, sets)
 
@@ -201,3 +203,24 @@ class Run:
         """Return the figures in `evaluation.json`, None where the run is not finished."""
         file = self.path / EVALUATION_FILE
         return json.loads(file.read_text("utf-8")) if file.exists() else None
+
+
+@contextlib.contextmanager
+def sole_trainer(path: Path) -> Iterator[None]:
+    """Lock a folder while training in it; a killed process releases the lock.
+
+    Where several processes train together, the first one holds it.
+
+    Raises:
+        RunError: another process holds it.
+    """
+    with contextlib.ExitStack() as stack:
+        if is_first_process():
+            file = stack.enter_context(open(path / LOCK_FILE, "w"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunError(
+                    f"{path}: got another process that trains in it, expected none; stop it, or wait"
+                ) from error
+        yield

@@ -24,21 +24,20 @@ def save(folder: Path, pictures: dict[str, Figure]) -> None:
         figure.savefig(folder / name, dpi=DPI)
 
 
-def reach_pictures(rows: list[dict[str, Any]], workspace: Reached, circle: Reached) -> dict[str, Figure]:
-    """Return the pictures of a run on the workspace, by file name."""
+def pictures(
+    rows: list[dict[str, Any]], result: Reached | AtPositions, *circle: Reached
+) -> dict[str, Figure]:
+    """Return the pictures of a run, by file name, from its metrics and the results of its evaluation."""
+    if isinstance(result, AtPositions):
+        return {
+            "learning_curve.png": imitation_curve(rows),
+            "losses.png": losses(rows),
+            "positions.png": positions_figure(result),
+        }
     return {
         "learning_curve.png": learning_curve(rows),
-        "circle.png": circle_figure(circle),
-        "workspace_error.png": workspace_figure(workspace),
-    }
-
-
-def imitation_pictures(rows: list[dict[str, Any]], at: AtPositions) -> dict[str, Figure]:
-    """Return the pictures of a run on demonstrated poses, by file name."""
-    return {
-        "learning_curve.png": imitation_curve(rows),
-        "losses.png": losses(rows),
-        "positions.png": positions_figure(at),
+        "circle.png": circle_figure(*circle),
+        "workspace_error.png": workspace_figure(result),
     }
 
 
@@ -154,9 +153,9 @@ def workspace_figure(workspace: Reached) -> Figure:
     share = 100 * np.arange(1, len(error) + 1) / len(error)
     axes.plot(np.maximum(np.sort(error), low), share, color=BLUE)
     for percent, colour in ((50, GREY), (95, ORANGE)):
-        at = float(np.quantile(error, percent / 100))
-        label = f"{percent} %: {at:.2f} mm"
-        axes.plot(np.maximum([at, at], low), [0, percent], color=colour, linewidth=1, label=label)
+        quantile = float(np.quantile(error, percent / 100))
+        label = f"{percent} %: {quantile:.2f} mm"
+        axes.plot(np.maximum([quantile, quantile], low), [0, percent], color=colour, linewidth=1, label=label)
     axes.set_ylim(0, 100)
     axes.legend(frameon=False, loc="upper left")
     return figure
@@ -189,9 +188,10 @@ def losses(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def positions_figure(at: AtPositions) -> Figure:
+def positions_figure(result: AtPositions) -> Figure:
     """Draw demonstrated and reached poses from the front, and errors and clearances along them."""
-    goal, pose, error = np.asarray(at.reached.goal), np.asarray(at.reached.pose), at.reached.tip_error_mm
+    reached = result.reached
+    goal, pose, error = np.asarray(reached.goal), np.asarray(reached.pose), reached.tip_error_mm
     figure, (left, middle, right) = _figure(
         12,
         ("poses from the front", "x [mm]", "z [mm]"),
@@ -203,9 +203,9 @@ def positions_figure(at: AtPositions) -> Figure:
     left.set_aspect("equal")
     left.legend(frameon=False, loc="upper right")
     position = np.arange(len(error))
-    middle.bar(position, error, color=np.where(at.success, BLUE, ORANGE))
-    if np.isfinite(at.reached.clearance_mm).all():
-        right.bar(position, at.reached.clearance_mm, color=BLUE)
+    middle.bar(position, error, color=np.where(result.success, BLUE, ORANGE))
+    if np.isfinite(reached.clearance_mm).all():
+        right.bar(position, reached.clearance_mm, color=BLUE)
     else:
         right.text(0.5, 0.5, "no pipe", ha="center", transform=right.transAxes, color=GREY)
     return figure

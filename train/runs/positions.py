@@ -12,7 +12,6 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.sensing.pose import pose_error
-from train.agent.learner import Learner
 from train.demos.demonstrations import Demonstrations
 from train.runs.evaluate import UNCORRECTED, Figures, Reached, figure, follower, nominal, start_keys
 
@@ -54,7 +53,7 @@ class PositionEvaluator:
     def __init__(
         self,
         env: ReachEnv,
-        learner: Learner,
+        learner: Any,
         demonstrations: Demonstrations,
         first: np.ndarray,
         n_actions: int = N_ACTIONS,
@@ -70,6 +69,16 @@ class PositionEvaluator:
     ) -> PositionEvaluator:
         """Return the same evaluation on another environment."""
         return PositionEvaluator(env, self.learner, self.demonstrations, self.first, n_actions, shift_limit)
+
+    @property
+    def title(self) -> str:
+        """Title of the table of figures."""
+        return f"{len(self.positions)} demonstrated positions"
+
+    def headline(self, row: dict[str, float]) -> str:
+        """Return a short text for a row of metrics with an evaluation."""
+        share, median_mm = row["evaluation/success_share"], row["evaluation/median_mm"]
+        return f"success at {100 * share:.0f} % of the positions, median {median_mm:.1f} mm"
 
     def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
         """Return figures, and results as NumPy arrays."""

@@ -10,12 +10,12 @@ from rich.console import Console
 from calib.arm import CalibratedArm
 from calib.changes import MIN_TIP_MM
 from mjx_softarm.mdp.actions import SHIFT_LIMIT
-from train.agent.registry import LEARNERS, name_of
+from train.agent.registry import learns_from_demonstrations
 from train.runs import run as runs
 from train.runs.checkpoint import RunError
 from train.runs.folder import DEMONSTRATIONS_FILE, Run
 
-# A policy needs no training while no error grows by more than this factor; by hand.
+# A policy needs no training while no error grows by more than this factor; chosen by hand.
 ENOUGH = 1.3
 # Figures that count: over the workspace median and 95 %, at demonstrated poses median and largest.
 ERRORS = {"median": "median_mm", "95 %": "p95_mm", "largest": "max_mm"}
@@ -37,15 +37,15 @@ def renewed(run: Run, arm: CalibratedArm) -> Run:
     return Run(run.path, run.config, arm._replace(spec=arm.spec.replace(springs=limits)))
 
 
-def told_enough(before: Run, now: Run, calibration: Path, console: Console) -> bool:
-    """Evaluate a policy in simulation on both calibrations; tell and return whether it needs no training.
+def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Console) -> bool:
+    """Evaluate a policy in simulation on both calibrations; print and return whether it needs no training.
 
     Goals are corrected by the whole error that an action leaves. The control loop does so for goals that
     stand, and tries less as well. So an error that the loop removes does not count, and a chamber at a limit
     counts by the error that it makes. Policies of motion are evaluated without correction. Errors are those
     of the tip's position; the models' own error counts with both calibrations.
 
-    By hand, without a file of results: policies of twins 0 to 2, each with the calibration of another twin,
+    Measured once, not stored: policies of twins 0 to 2, each with the calibration of another twin,
     have medians of 0.1, 0.1, 3.6, 4.3, 9.2 and 13.2 mm with corrected goals, 17 to 42 mm without. On the
     circle of that twin they are 0.7, 0.7, 4.4, 5.7, 12.1 and 14.4 mm off.
 
@@ -68,8 +68,8 @@ def told_enough(before: Run, now: Run, calibration: Path, console: Console) -> b
         console.print("enough without training")
         return True
     # The command that goes on, with the settings that the run began with
-    learns_from_poses = LEARNERS[name_of(before.config.learner)].from_demonstrations
-    task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if learns_from_poses else "reach"
+    shown = learns_from_demonstrations(before.config.learner)
+    task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if shown else "reach"
     preset = before.origin()["preset"]
     options = f"--agent {before.path} --calibration {calibration}" + (f" --preset {preset}" if preset else "")
     console.print(

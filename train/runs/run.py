@@ -23,7 +23,7 @@ from train.agent.learner import LearnerConfig
 from train.agent.registry import name_of
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
-from train.epoch.state import TrainState
+from train.epoch.job import State
 from train.runs.checkpoint import RunError
 from train.runs.folder import EVALUATION_FILE, Run
 from train.runs.task import Task, task_of
@@ -51,7 +51,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
         RunError: arms in motion diverge.
     """
 
-    def begin() -> tuple[int, TrainState]:
+    def begin() -> tuple[int, State]:
         learner = run.config.learner
         console.print(
             f"compiling an epoch of {learner.n_arms} arms with updates of {name_of(learner)} "
@@ -61,7 +61,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
         run.rewind(epoch)
         return epoch, state
 
-    def first() -> tuple[int, TrainState]:
+    def first() -> tuple[int, State]:
         if run.checkpoints.latest is None:
             return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
         return run.checkpoints.restore(task.job.like())
@@ -73,9 +73,10 @@ def train(run: Run, task: Task, console: Console) -> Any:
 def train_together(
     job: Any,
     members: Sequence[tuple[Run, Task]],
-    begin: Callable[[], tuple[int, TrainState]],
+    begin: Callable[[], tuple[int, State]],
     path: Path,
     console: Console,
+    member: Callable[[State, int], State] = lambda state, k: state,
 ) -> list[Any]:
     """Train all members of one job to their end: a single run, or the runs of a sweep.
 
@@ -86,6 +87,7 @@ def train_together(
             state after them.
         path: folder that `--resume` continues.
         console: shows progress.
+        member: takes the state of the k-th member from the job's.
 
     Returns:
         Figures of each member's final policy.
@@ -114,18 +116,19 @@ def train_together(
             # Evaluate, record and save each member.
             for k, ((run, task), board, row) in enumerate(zip(members, boards, rows, strict=True)):
                 refuse_divergence(run.config, row["env/unsettled"])
-                own = job.member(state, k) if due or stop else None
-                if own is not None and due:
+                member_state = member(state, k) if due or stop else None
+                if member_state is not None and due:
                     with noted(console, "compiling the evaluation ..."):
-                        row |= evaluation(run, task, learner.policy(own.learner))
+                        row |= evaluation(run, task, learner.policy(member_state.learner))
                 record(run, board, epoch, row)
-                if own is not None:
-                    run.checkpoints.save(epoch, own, learner.parts(own.learner))
+                if member_state is not None:
+                    run.checkpoints.save(epoch, member_state, learner.parts(member_state.learner))
             show(epoch, _line(rows, shared), due)
             if stop and epoch < n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {path}")
-    states = (job.member(state, k) for k in range(len(members)))
-    return [finish(*member, learner.policy(own.learner)) for member, own in zip(members, states, strict=True)]
+    return [
+        finish(run, task, learner.policy(member(state, k).learner)) for k, (run, task) in enumerate(members)
+    ]
 
 
 @contextmanager
@@ -153,11 +156,12 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
     from train.runs import plots  # matplotlib takes half a second to import
 
-    summary, *reached = task.evaluate(policy)
+    results: Any
+    summary, *results = task.evaluate(policy)
     if is_first_process():
-        run.write_poses(*reached)
+        run.write_poses(*results)
         write_json(run.path / EVALUATION_FILE, summary.to_dict())
-        plots.save(run.path, task.pictures(run.metrics(), *reached))
+        plots.save(run.path, plots.pictures(run.metrics(), *results))
     return summary
 
 
@@ -171,7 +175,7 @@ def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations(), mesh)
 
 
-def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[TrainState, dict[str, Any]]:
+def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State, dict[str, Any]]:
     """Return the state that a new run begins with, and its parts; some of these are another run's.
 
     Args:
@@ -202,9 +206,7 @@ def open_board(run: Run, epoch: int) -> SummaryWriter:
     return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
 
 
-def timed_epoch(
-    job: Any, state: TrainState, learner: LearnerConfig, epoch: int
-) -> tuple[TrainState, dict[str, Any]]:
+def timed_epoch(job: Any, state: State, learner: LearnerConfig, epoch: int) -> tuple[State, dict[str, Any]]:
     """Return the next state of a job, and its metrics with the speeds of each member."""
     start = time.perf_counter()
     state, metrics = job.epoch(state)
@@ -243,7 +245,7 @@ def _line(rows: Sequence[dict[str, float]], task: Task) -> str:
     if "evaluation/median_mm" not in row:
         return text
     if n == 1:
-        return f"{text}  {task.headline(row)}"
+        return f"{text}  {task.evaluate.headline(row)}"
     medians = [row["evaluation/median_mm"] for row in rows]
     return f"{text}  held-out medians {np.min(medians):.1f} to {np.max(medians):.1f} mm"
 
@@ -282,7 +284,7 @@ def shown_progress(
 
 @contextmanager
 def asked_to_stop() -> Iterator[list[int]]:
-    """Yield a list that fills when the process is asked to stop; a second Ctrl-C stops at once."""
+    """Yield the stop signals received, a list that grows; a second Ctrl-C stops at once."""
     asked: list[int] = []
 
     def note(number: int, _frame: Any) -> None:

@@ -1,47 +1,27 @@
-"""Tasks of a run: to reach the whole workspace, or to reach positions as an expert showed.
-
-A task composes a job of arms, goals and learner, and says how it is evaluated, shown, and prepared for an
-epoch.
-"""
+"""Tasks of a run: to reach the whole workspace, or to reach positions as an expert showed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from jax.sharding import Mesh
 
-from mjx_softarm._support.lazy import LazyModule
 from mjx_softarm.env import ReachEnv
-from train.agent.imitation import ImitationConfig
-from train.agent.learner import Learner
-from train.agent.registry import LEARNERS, World, learner_of, name_of
-from train.config import ConfigError, TrainConfig
+from train.agent.registry import epoch_of, learns_from_demonstrations
+from train.config import TrainConfig
 from train.demos.demonstrations import Demonstrations
-from train.epoch.goals import DemonstratedGoals
-from train.epoch.job import Job
-from train.epoch.poses import Poses
-from train.epoch.state import TrainState
-from train.runs.evaluate import N_GOALS, Evaluator
+from train.epoch.job import FreshPoses, Job, State
+from train.runs.evaluate import Evaluator
 from train.runs.positions import PositionEvaluator
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from train.runs import plots
-else:
-    plots = LazyModule("train.runs.plots")
 
 
 class Task(NamedTuple):
-    """Job of a run, and how the run is evaluated, shown, and prepared for an epoch."""
+    """Job of a run, its evaluation, and what happens before each epoch."""
 
     job: Job
-    title: str  # of the table of figures
     evaluate: Evaluator | PositionEvaluator
-    pictures: Callable[..., dict[str, Figure]]  # rows of metrics, results -> figures by name
-    headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a short text
-    prepare: Callable[[TrainState, int], TrainState]  # state, epoch that follows -> state
+    prepare: Callable[[State, int], State]  # state, number of epochs done -> state
 
 
 def task_of(
@@ -62,55 +42,23 @@ def task_of(
         ConfigError: the learner needs demonstrations and has none, or the run cannot be split evenly over the
             devices of the mesh.
     """
-    name, world = name_of(config.learner), World(env, mesh, demonstrations)
-    if LEARNERS[name].from_demonstrations:
-        if demonstrations is None:
-            raise ConfigError(f"learner: got {name!r} without demonstrations, expected a file of them")
-        own = cast(ImitationConfig, config.learner)
-        return _imitation(own, env, demonstrations, mesh, learner_of(own, world))
-    # Goals over the whole workspace, held-out ones for the evaluation.
-    poses = Poses(env, config)
-    job = Job(config.learner, env, learner_of(config.learner, world), mesh=mesh, pool_of=poses.at)
-    return Task(
-        job=job,
-        title=f"{N_GOALS} held-out goals",
-        evaluate=Evaluator(env, job.learner),
-        pictures=lambda *found: plots.reach_pictures(*found),
-        headline=lambda row: f"held-out median {row['evaluation/median_mm']:.1f} mm",
-        prepare=lambda state, epoch: state,
-    )
+    epoch = epoch_of(config.learner, env, mesh, demonstrations)
+    if learns_from_demonstrations(config.learner):
+        return _at_positions(epoch, demonstrations)
+    return Task(Job(epoch, fresh_poses(config, env)), Evaluator(env, epoch.learner), lambda state, k: state)
 
 
-def _imitation(
-    config: ImitationConfig,
-    env: ReachEnv,
-    demonstrations: Demonstrations,
-    mesh: Mesh | None,
-    learner: Learner,
-) -> Task:
-    # Arms whose goals are demonstrated positions, and the evaluation at these.
-    goals = DemonstratedGoals(config, env, demonstrations)
-    job = Job(config, env, learner, goals, mesh)
-    evaluate = PositionEvaluator(env, learner, demonstrations, goals.of_stage(0))
+def fresh_poses(config: TrainConfig, env: ReachEnv) -> FreshPoses:
+    """Return the pools of poses of a run."""
+    return FreshPoses(env, config.fresh_poses_epochs, config.learner.n_epochs, config.seed)
 
-    # Before an epoch: begin a stage of goals, or shift the goals to the positions with the largest errors.
-    def prepare(state: TrainState, epoch: int) -> TrainState:
-        every = config.rebalance_epochs
-        if every and epoch and epoch % every == 0 and epoch not in config.stage_epochs:
-            summary, _ = evaluate(job.policy(state))
-            state = goals.rebalance(state, epoch, summary.error_mm)
-        else:
-            state = goals.begin_stage(job, state, epoch)
-        return job.place(state)
 
-    return Task(
-        job=job,
-        title=f"{len(demonstrations.positions)} demonstrated positions",
-        evaluate=evaluate,
-        pictures=lambda *found: plots.imitation_pictures(*found),
-        headline=lambda row: (
-            f"success at {100 * row['evaluation/success_share']:.0f} % of the positions, "
-            f"median {row['evaluation/median_mm']:.1f} mm"
-        ),
-        prepare=prepare,
-    )
+def _at_positions(epoch: Any, demonstrations: Any) -> Task:
+    job = Job(epoch)
+    evaluate = PositionEvaluator(epoch.env, epoch.learner, demonstrations, epoch.goals.of_stage(0))
+
+    def prepare(state: State, k: int) -> State:
+        errors_mm = lambda: evaluate(job.policy(state))[0].error_mm  # noqa: E731
+        return job.place(epoch.goals.prepare(state, k, errors_mm))
+
+    return Task(job, evaluate, prepare)

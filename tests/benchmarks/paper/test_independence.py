@@ -15,7 +15,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp import rewards
 from tests.train.small import SHORT
-from train.agent.analytic import Analytic
+from train.agent.analytic import GradientEpoch
 from train.config import override
 from train.presets import PRESETS
 
@@ -59,7 +59,7 @@ def test_pressures_cost_the_error_of_the_pose_alone(arms):
     after = jax.tree.map(lambda x: x[0], arms.step(arms.start, jnp.stack([action, action]))[0])
     arm, reward = after.pipeline_state, arms.env.config.reward
     error = rewards.scaled_error(arm.pose, arm.goal, reward)
-    cost = Analytic(config.learner, arms.env)._cost(action, after)
+    cost = GradientEpoch(config.learner, arms.env)._cost(action, after)
     np.testing.assert_allclose(cost, jnp.linalg.norm(error) / reward.threshold, rtol=1e-5)
 
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from calib.fit.held_pressures import fit_held_pressures, hysteresis_kpa
-from mjx_softarm._support.archive import SealedFileError, entries_of, write_sealed
+from mjx_softarm._support.archive import SealedFileError
 from mjx_softarm.control import allocation, chambers_of_springs
 from mjx_softarm.sensing.held_pressures import (
-    KIND,
     PRESSURES_FILE,
     find_pressures,
     held_kpa,
@@ -15,7 +14,6 @@ from mjx_softarm.sensing.held_pressures import (
     save_pressures,
 )
 from mjx_softarm.sensing.hysteresis import stops
-from mjx_softarm.sensing.load import COMMON_FACTOR
 from mjx_softarm.spec import ArmSpec, SpecError
 
 SPEC = ArmSpec.default()
@@ -92,15 +90,6 @@ def test_the_file_gives_the_process_back_for_its_own_arm(fit, tmp_path):
         np.testing.assert_array_equal(one, other)
     with pytest.raises(SealedFileError, match="pressures.state: got float64"):
         find_pressures(tmp_path, 2, 6, 6)
-
-
-def test_a_file_of_before_has_no_factor(fit, tmp_path):
-    entries = entries_of(KIND, fit.held._replace(factor=0.9))
-    for name in ("factor", "factor_sd"):
-        del entries[f"{KIND}.{name}"]
-    write_sealed(tmp_path / PRESSURES_FILE, entries, KIND)
-    found = find_pressures(tmp_path, *SIZES)
-    assert (found.factor, found.factor_sd) == (1.0, COMMON_FACTOR)
 
 
 def test_pressures_that_move_nothing_are_no_residual(four_chamber_arm):

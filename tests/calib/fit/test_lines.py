@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.calibration.logs import ASU_LOGS, read_asu, still_rows
 from scipy.optimize import least_squares
 
+from benchmarks.accuracy.calibration import ASU_LOGS, read_asu, still_rows
 from calib.fit import lines
 from calib.fit.lines import HUBER, fit_line
 

@@ -100,14 +100,6 @@ def test_a_lag_beyond_those_tried_is_not_believed(quick, monkeypatch):
     assert to_json([section], [], {})["parts"]["Damping"]["figures"]["shape"]["log_std"] is None
 
 
-def test_the_report_tells_the_lag_s_own_interval(quick):
-    found = fit_shape([quick], SPEC)
-    section = sections.damping(DAMPING, found)
-    [before, fitted] = section.tables[-1].rows
-    assert fitted == ("fitted", found.lag_s, QUANTILE * found.log_std * found.lag_s, found.rms_mm)
-    assert before[2] == "" and section.warnings == DAMPING.warnings
-
-
 def test_the_damping_fit_has_the_interval_of_the_lag_as_its_prior(quick, monkeypatch):
     asked = []
 

@@ -64,13 +64,6 @@ def test_warnings_with_one_remedy_are_a_line_with_their_count():
     ]
 
 
-def test_verdict_names_the_parts_with_warnings():
-    good, bad = (Page(to_html("x", make_parts(w), [], {})) for w in ((), ("spring 3: too short a range",)))
-    assert good.texts["p"][0].startswith("Every fitted step met")
-    assert bad.texts["p"][0] == "Look at Springs before you trust this."
-    assert "spring 3: too short a range" in bad.texts["li"]
-
-
 def test_names_and_findings_are_text_not_markup():
     findings = ["a.csv: <script>alert(1)</script>"]
     page = Page(to_html("<b>arm</b>", make_parts(("<i>",)), findings, {"x": "<u>"}))
@@ -85,9 +78,3 @@ def test_json_has_the_same_figures_and_says_whether_to_trust_them():
     assert data["parts"]["Springs"] == {"figures": {"beta": [0.93]}, "warnings": [], "notes": []}
     assert data["provenance"] == PROVENANCE
     assert to_json(make_parts(("no",)), [], {})["trustworthy"] is False
-
-
-def test_a_note_is_shown_and_costs_no_trust():
-    part = Section("Chambers", "Fitted.", notes=("a quaternion is off",))
-    assert "a quaternion is off" in Page(to_html("x", (part,), [], {})).texts["p"]
-    assert to_json((part,), [], {})["trustworthy"] is True

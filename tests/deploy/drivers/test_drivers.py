@@ -3,7 +3,6 @@
 import os
 import pty
 import threading
-import time
 import tty
 
 import numpy as np
@@ -132,16 +131,6 @@ def test_what_the_arm_refuses_is_an_error_and_what_it_garbles_is_lost(line):
     assert arm.read_sensors().min() > 1e6
 
 
-def test_two_requests_without_an_answer_take_their_timeouts(line):
-    arm, controller = line
-    arm.timeout_s, controller.silent = 0.1, 2
-    begin_s = time.monotonic()
-    for ask in (arm.read_sensors, lambda: arm.write_pressures(np.zeros(N))):
-        with pytest.raises(TimeoutError):
-            ask()
-    assert 0.2 <= time.monotonic() - begin_s < 0.4
-
-
 def test_board_that_begins_anew_is_waited_for(request, monkeypatch):
     pytest.importorskip("serial")
     controller = Controller()
@@ -175,12 +164,6 @@ def test_recording_over_the_line(line, monkeypatch):
     assert result.ending.cause == "" and len(result.log) == 1 and not controller.arm.command_kpa.any()
     np.testing.assert_allclose(result.log.pressure_kpa, -5.0, atol=1e-4)
     np.testing.assert_allclose(read_m(result.log), REST_M - 5.0 * 9e-4, atol=5e-5)
-
-
-def test_port_that_is_not_there_is_named():
-    pytest.importorskip("serial")
-    with pytest.raises(InputError, match="SerialArm: got SerialException: .*ttyACM0.*; expected an arm"):
-        open_arm("mjx_softarm.deploy.drivers.serial_line:SerialArm")
 
 
 def test_an_arm_by_its_settings(request, tmp_path):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from train.agent.gail import Gail, GailConfig, cross_entropy, gradient_penalty, learned_reward
-from train.agent.tqc import TQC, TQCConfig, Transition
+from train.agent.learner import Transition
+from train.agent.tqc import TQC, TQCConfig
 
 RNG = np.random.default_rng(0)
 OBS, ACTION = RNG.normal(size=(64, 5)), RNG.normal(size=(64, 3))

@@ -9,8 +9,8 @@ import pytest
 
 from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import Imitation
-from train.agent.learner import Experience
-from train.agent.tqc import Transition
+from train.agent.learner import Experience, Transition
+from train.epoch.replay_epoch import ReplayEpoch
 
 B = 16
 
@@ -37,14 +37,18 @@ def stored(short_env, shown):
     return Experience(pose, goal, action, pose, action, row < 0, cost, jnp.ones(B))
 
 
+def relabelled(learner, stored):
+    """The batch that an epoch makes of stored transitions."""
+    return ReplayEpoch(learner.config, learner.env, learner).relabel(stored, jax.random.PRNGKey(0))
+
+
 def test_the_experts_rows_are_right_answers_to_their_goals(new, short_env, stored):
     """The arm reaches a row's goal with the expert's action of that row."""
     learner = new()
 
     @jax.jit
     def answered(stored):
-        own, _ = learner.learner.transitions(stored, jax.random.PRNGKey(0))
-        batch = learner.with_expert(own, stored, (jnp.arange(B) + 1) % 6)
+        batch = learner.with_expert(relabelled(learner, stored), (jnp.arange(B) + 1) % 6)
         arms = jax.vmap(short_env.reset)(jax.random.split(jax.random.PRNGKey(4), 4))
         return batch, jax.vmap(short_env.step)(arms, batch.action[:4])
 
@@ -65,8 +69,8 @@ def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged
     start = short_env.observe(stored.pose, stored.goal)
     elsewhere = short_env.observe(stored.pose, stored.goal + jnp.array([1.0, 0, 0, 0, 0, 0]))
     obs = jnp.where(hindsight[:, None], elsewhere, start)
-    batch = Transition(obs, stored.action, jnp.where(expert, 100.0, given), obs, jnp.zeros(B))
-    rewards, _ = learner.rewards(batch, stored, hindsight, discriminator)
+    batch = Transition(obs, stored.action, jnp.where(expert, 100.0, given), obs, jnp.zeros(B), stored)
+    rewards, _ = learner.rewards(batch, hindsight, discriminator)
     learned = np.where(hindsight, 0.0, learner.gail.reward(discriminator.params, obs, stored.action))
     assert np.all(learned[:12] < 0.0)
     expected = np.where(expert, 0.5 * 100.0, 0.5 * -3.0 - stored.clearance_cost) + 2.0 * learned
@@ -77,9 +81,8 @@ def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged
 def test_an_update_moves_the_discriminator_unless_it_is_frozen(new, stored, frozen):
     learner = new(frozen=frozen)
     before = jax.jit(learner.init)(jax.random.PRNGKey(0))
-    after, metrics = jax.jit(lambda state, key: learner.update(state, lambda *_: stored, key))(
-        before, jax.random.PRNGKey(1)
-    )
+    update = jax.jit(lambda state, key: learner.update(state, relabelled(learner, stored), key))
+    after, metrics = update(before, jax.random.PRNGKey(1))
     heads = [state.discriminator.params["params"]["head"]["kernel"] for state in (before, after)]
     assert np.array_equal(*heads) == frozen and ("gail/accuracy" in metrics) != frozen
     assert float(metrics["gail/reward"]) < 0.0
@@ -93,11 +96,14 @@ def test_as_printed_the_expert_is_at_the_pose_shown_before_and_relabelled_goals_
     learner, seen = new(expert_start="shown", expert_share=0.0, hindsight=HindsightConfig(1.0)), {}
     update = learner.gail.update
     learner.gail.update = lambda s, e, a, key: seen.update(expert=e, agent=a) or update(s, e, a, key)
-    learner.learner.learn = lambda agent, batch, key: seen.update(batch=batch) or (agent, {})
+    learner.tqc.update = lambda agent, batch, key: seen.update(batch=batch) or (agent, {})
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
-    after, seen = jax.jit(lambda *given: (learner.update(given[0], lambda *_: given[1], given[2])[0], seen))(
-        state, stored, jax.random.PRNGKey(1)
-    )
+
+    @jax.jit
+    def run(state, stored, key):
+        return learner.update(state, relabelled(learner, stored), key)[0], seen
+
+    after, seen = run(state, stored, jax.random.PRNGKey(1))
     goal = (np.arange(B) + 1) % 6
     positions = jnp.asarray(shown.positions)
     shown_at = short_env.observe(positions[np.maximum(goal - 1, 0)], positions[goal])  # one sequence
@@ -111,7 +117,7 @@ def test_as_printed_the_expert_is_at_the_pose_shown_before_and_relabelled_goals_
 
 
 def test_parts_of_other_runs_are_taken(new):
-    learner, reach = new(), new().learner
+    learner, reach = new(), new().tqc
     init = jax.jit(learner.init)
     state, donor = init(jax.random.PRNGKey(0)), init(jax.random.PRNGKey(1))
     same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731

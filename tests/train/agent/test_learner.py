@@ -15,12 +15,13 @@ from calib.arm import CalibratedArm
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
 from tests.train.small import SHORT
+from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import ImitationConfig
-from train.agent.learner import Learner, ReplayConfig
 from train.agent.networks import Actor
-from train.agent.registry import LEARNERS, Entry
+from train.agent.registry import LEARNERS, Entry, with_replay
 from train.agent.tqc import TQCConfig
 from train.config import ConfigError, TrainConfig
+from train.epoch.replay_epoch import ReplayConfig
 from train.runs.arm_model import DistilledArm
 from train.runs.checkpoint import RunError
 from train.runs.evaluate import Evaluator
@@ -37,21 +38,22 @@ SETTINGS = ReplayConfig(
     batch_size=64,
     replay_capacity=512,
     vector_steps_per_epoch=4,
+    hindsight=HindsightConfig(reached_share=1.0),
 )
-CONFIG = TrainConfig(learner=SETTINGS, evaluation_epochs=2, env=EnvConfig(n_poses=256))
+CONFIG = TrainConfig(learner=SETTINGS, evaluation_epochs=2, env=EnvConfig(engine="chain", n_poses=256))
 
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 
-class Regression(Learner):
-    """A network fitted to the actions that led to the poses reached."""
+class Regression:
+    """A network fitted to the actions that led to the poses reached, which hindsight makes the goals."""
 
-    def __init__(self, env):
-        self.env, self.network, self.optimizer = env, Actor(env.action_size, (16,)), optax.adam(1e-2)
+    def __init__(self, obs_size, action_size, config):
+        self.obs_size, self.network, self.optimizer = obs_size, Actor(action_size, (16,)), optax.adam(1e-2)
 
     def init(self, key):
-        params = self.network.init(key, jnp.zeros(self.env.observation_size))
+        params = self.network.init(key, jnp.zeros(self.obs_size))
         return params, self.optimizer.init(params)
 
     def act(self, state, obs, key):
@@ -64,10 +66,15 @@ class Regression(Learner):
     def mode(self, policy, obs):
         return jnp.tanh(self.network.apply(policy, obs)[0])
 
-    def update(self, state, sample, key):
-        stored = sample(key)
-        obs = self.env.observe(stored.pose, stored.next_pose)
-        error = lambda params: jnp.mean((self.mode(params, obs) - stored.sensed_action) ** 2)  # noqa: E731
+    def parts(self, state):
+        return {"policy": state[0]}
+
+    def adopt(self, state, parts):
+        raise ValueError(f"got a donor of {', '.join(parts)}, expected none for this learner")
+
+    def update(self, state, batch, key):
+        answer = batch.stored.sensed_action
+        error = lambda params: jnp.mean((self.mode(params, batch.obs) - answer) ** 2)  # noqa: E731
         loss, grads = jax.value_and_grad(error)(state[0])
         updates, opt_state = self.optimizer.update(grads, state[1])
         return (optax.apply_updates(state[0], updates), opt_state), {"regression/loss": loss}
@@ -84,8 +91,7 @@ def task():
 def known():
     """The learner stands in the registry."""
     with pytest.MonkeyPatch.context() as patch:
-        entry = Entry(ReplayConfig, lambda config, world: Regression(world.env))
-        patch.setitem(LEARNERS, "regression", entry)
+        patch.setitem(LEARNERS, "regression", Entry(ReplayConfig, with_replay(Regression)))
         yield
 
 
@@ -126,7 +132,7 @@ def test_a_policy_that_the_file_cannot_hold_is_refused(run, tmp_path, arm, monke
 
 
 def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
-    learner = TQCConfig(**dataclasses.asdict(SETTINGS))
+    learner = TQCConfig(**{**dataclasses.asdict(SETTINGS), "hindsight": SETTINGS.hindsight})
     other = task_of(dataclasses.replace(CONFIG, learner=learner), task.job.env)
     with pytest.raises(RunError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
         run.checkpoints.restore(other.job.like())

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.agent.networks import Actor, Critics, squash
+from train.agent.networks import Actor, squash
+from train.agent.tqc import Critics
 
 pytestmark = pytest.mark.usefixtures("strict", "quick_compiler")
 

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.agent.tqc import TQC, TQCConfig, Transition
+from train.agent.learner import Transition
+from train.agent.tqc import TQC, TQCConfig
 
 GAMMA = 0.9
 ALPHA, ALPHA_TWO_STEP = 0.02, 0.5

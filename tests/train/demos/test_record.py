@@ -67,10 +67,10 @@ def fingers_m(log):
 
 
 def test_recorded_positions_are_the_waypoints(expert, waypoints, plan, shift_mm):
-    told = []
+    printed = []
     arm = IdealArm()
-    result = WaypointRecorder(arm, expert, told.append).record(waypoints[:3], plan, sequence=3)
-    assert result.ending.status == 0 and len(result.log) == len(told) == 3
+    result = WaypointRecorder(arm, expert, printed.append).record(waypoints[:3], plan, sequence=3)
+    assert result.ending.status == 0 and len(result.log) == len(printed) == 3
     wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:3]])
     off_m = np.linalg.norm(fingers_m(result.log) - wanted_m, axis=1)
     assert off_m.max() < CLOSE_M < 1e-3 * np.linalg.norm(shift_mm)  # uncorrected, it is off by the shift
@@ -185,14 +185,14 @@ def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monke
     _, pipe = task("pipe300", SPEC)
     monkeypatch.setattr("train.demos.command.task", lambda name, spec: (waypoints[:2], pipe))
     out = tmp_path / "demos.csv"
-    status, told = command(*RECORD, out, "--task", "pipe300")
-    assert status == 0, told
-    assert f"demonstrations: {out}, 2 poses" in told and "furthest from its waypoint: " in told
+    status, printed = command(*RECORD, out, "--task", "pipe300")
+    assert status == 0, printed
+    assert f"demonstrations: {out}, 2 poses" in printed and "furthest from its waypoint: " in printed
     log, _ = read_demonstrations(out, SPEC)
     wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:2]])
     assert np.linalg.norm(fingers_m(log) - wanted_m, axis=1).max() < CLOSE_M
-    status, told = command("check", out)
-    assert status == 0 and "poses: 2" in told and "sequences: 1: 0 with 2" in told
+    status, printed = command("check", out)
+    assert status == 0 and "poses: 2" in printed and "sequences: 1: 0 with 2" in printed
 
 
 def test_misuse_is_told_before_anything_moves(command, tmp_path):
@@ -207,5 +207,5 @@ def test_misuse_is_told_before_anything_moves(command, tmp_path):
         ),
         (("check", tmp_path / "none.csv"), "none.csv: got 'No such file"),
     ):
-        status, told = command(*args)
-        assert status == 2 and message in told
+        status, printed = command(*args)
+        assert status == 2 and message in printed

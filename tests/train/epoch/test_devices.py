@@ -19,6 +19,7 @@ from mjx_softarm.env import ReachEnv
 from tests.train import small
 from tests.train.small import SHORT, new_job
 from train.__main__ import main
+from train.agent.registry import epoch_of
 from train.config import ConfigError
 from train.epoch.devices import mesh_of, split
 from train.runs.folder import Run
@@ -89,8 +90,9 @@ def test_each_device_has_its_share_of_arms_and_replay_and_all_of_the_networks(tr
 _MOVES = re.compile(r"= .* (all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter)")
 
 
-def test_arms_step_and_start_anew_without_waiting_for_other_devices(jobs, trained):
-    arms, state = jobs[str(N_DEVICES)].arms, trained[str(N_DEVICES)][0]
+def test_arms_step_and_start_anew_without_waiting_for_other_devices(env, trained):
+    arms = epoch_of(LEARNER, env, mesh_of(str(N_DEVICES))).arms
+    state, _ = trained[str(N_DEVICES)]
     action = jax.device_put(jax.numpy.zeros((arms.n, arms.env.action_size)), split(arms.mesh))
     program = jax.jit(arms.step).lower(state.arms, action, jax.random.PRNGKey(0)).compile().as_text()
     assert f"f32[{arms.n // N_DEVICES},{arms.env.action_size}]" in program  # each has its share

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
-from mjx_softarm.env import ReachEnv
+from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from tests.train.small import CONFIG, SHORT, new_job
+from train.epoch.job import FreshPoses
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 
@@ -31,6 +32,7 @@ def assert_equal(a, b):
 
 
 MOVING = {
+    "engine": "mjx",
     "mode": "dynamic",
     "observation": "motion",
     "dynamic_step_s": 0.04,
@@ -39,7 +41,7 @@ MOVING = {
 }
 
 
-@pytest.mark.parametrize("change", [{}, {"engine": "chain"}, MOVING], ids=["mjx", "chain", "dynamic"])
+@pytest.mark.parametrize("change", [{}, {"engine": "mjx"}, MOVING], ids=["chain", "mjx", "dynamic"])
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
     if config.env.moves:  # with goals that the episode reached later, and critics that observe a prediction
@@ -116,3 +118,25 @@ def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tm
     for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
         with pytest.raises(RunError, match=f"{tmp_path}: got a checkpoint of other parts or sizes"):
             run.checkpoints.restore(other)
+
+
+POSES = EnvConfig(n_poses=32, even_share=0.5)
+
+
+@pytest.fixture(scope="module")
+def pools():
+    """Arguments -> pools of a run of six epochs, each for two of them."""
+    env = ReachEnv(SHORT, POSES)
+    return lambda every=2, seed=0: FreshPoses(env, every, 6, seed)
+
+
+def test_a_pool_serves_some_epochs_and_each_run_has_its_own(pools):
+    pool_of = pools()
+    poses = [np.asarray(pool_of(epoch).pose) for epoch in range(6)]
+    for epoch, pose in enumerate(poses):
+        assert np.array_equal(pose, poses[epoch // 2 * 2]) and pose.shape == (32, 6)
+    every = np.concatenate([*poses[::2], pools(seed=1)(0).pose])
+    assert len(np.unique(every[:, 0].round(3))) > 3 * 32  # a pool may have a pose twice
+    np.testing.assert_array_equal(poses[4], pools()(4).pose)  # of a run that goes on
+    lasting = pools(every=0)
+    assert lasting(0) is lasting(5)

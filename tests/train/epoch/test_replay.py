@@ -26,7 +26,7 @@ add, thin = jax.jit(replay.add), jax.jit(replay.thin)
 
 
 def rows(tags):
-    """Items whose vector can be told from their tag."""
+    """Items whose vector follows from their tag."""
     tags = np.asarray(tags, np.int32)
     return Item(jnp.asarray(tags), jnp.asarray(np.stack([tags, -tags], axis=-1), jnp.float32))
 
@@ -100,7 +100,7 @@ def test_thinning_draws_every_item_alike():
 
 
 def test_an_item_ahead_is_the_same_row_of_a_later_addition():
-    """A ring that has wrapped around holds three additions; tags tell where items came from."""
+    """A ring that has wrapped around holds three additions; tags say where items came from."""
     ring = replay.create(EXAMPLE, 3 * BATCH)
     for step in range(5):
         ring = add(ring, rows(np.arange(BATCH) + step * BATCH), jnp.ones(BATCH, bool))

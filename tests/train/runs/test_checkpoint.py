@@ -13,9 +13,9 @@ from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 from tests.train.small import LEARNER
 from train.agent.analytic import AnalyticConfig
-from train.agent.registry import World, learner_of
+from train.agent.registry import epoch_of
 from train.config import TrainConfig
-from train.epoch.state import TrainState
+from train.epoch.replay_epoch import ReplayState
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 
@@ -59,21 +59,21 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
         "analytic": AnalyticConfig(hidden=(16,), n_arms=8),
         "imitation": config.learner,
     }
-    for name, own_config in configs.items():
-        learner = learner_of(own_config, World(short_env, demonstrations=shown))
+    for name, learner_config in configs.items():
+        learner = epoch_of(learner_config, short_env, None, shown).learner
         run = Run.create(tmp_path / name, config, CalibratedArm(short_env.spec))
         with pytest.raises(RunError, match="got no checkpoint, expected one"):
             run.policy()
-        own = jax.jit(learner.init)(jax.random.PRNGKey(0))
-        run.checkpoints.save(1, TrainState(None, own, None, (), zero, zero), learner.parts(own))
-        jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(own)))
+        state = jax.jit(learner.init)(jax.random.PRNGKey(0))
+        run.checkpoints.save(1, ReplayState(None, state, None, (), zero, zero), learner.parts(state))
+        jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(state)))
 
 
 @pytest.fixture
 def saved(tmp_path):
     """A run with checkpoints of two epochs, and the shapes of its state."""
     zero = jnp.zeros((), jnp.int32)
-    state = TrainState(None, {"weight": jnp.arange(64.0)}, None, (), zero, zero)
+    state = ReplayState(None, {"weight": jnp.arange(64.0)}, None, (), zero, zero)
     run = Run.create(tmp_path / "run", CONFIG, ARM)
     for epoch in (10, 20):
         run.checkpoints.save(epoch, state, {"policy": {"weight": jnp.arange(64.0)}})

@@ -66,7 +66,7 @@ class Scripted:
 
 @pytest.fixture(scope="module")
 def evaluator(short_env):
-    """Evaluator that takes two actions to each goal, and tells as `near_s` how many were taken."""
+    """Evaluator that takes two actions to each goal, and reports their number as `near_s`."""
 
     def counted(env, learner, policy, state, goal, *how, take=evaluate.reach):
         after, result = take(env, learner, policy, state, goal, *how)

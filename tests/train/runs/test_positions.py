@@ -1,4 +1,4 @@
-"""Evaluation on demonstrated positions: figures, walls, and the first stage told apart."""
+"""Evaluation on demonstrated positions: figures, walls, and the first stage by itself."""
 
 import dataclasses
 
@@ -53,7 +53,7 @@ def test_positions_are_evaluated_with_body_and_pressures(short_env, evaluator, s
     assert (np.isinf(at.reached.clearance_mm) if pipe_mm is None else at.reached.clearance_mm < 0.0).all()
 
 
-def test_success_at_the_first_stages_positions_is_told_apart():
+def test_success_at_the_first_stages_positions_has_figures_of_its_own():
     zero, poses = np.zeros(3), np.zeros((3, 6))
     reached = Reached(poses, poses, zero, zero, zero == 0, zero, np.array([5.0, -1, -1]), zero, zero)
     figures, _ = summarise(reached, 0.03, np.array([True, True, False]))

@@ -14,7 +14,7 @@ from mjx_softarm.mdp.actions import SHIFT_LIMIT
 from tests.train.small import CONFIG, SHORT
 from train.runs.checkpoint import RunError
 from train.runs.folder import Run
-from train.runs.renew import renewed, told_enough
+from train.runs.renew import policy_still_accurate, renewed
 
 
 def test_another_arm_is_refused(tmp_path):
@@ -52,7 +52,7 @@ def test_training_is_needed_where_errors_grow(median_mm, p95_mm, s2r_mm, enough,
     then = run_of("tqc", "payload")
     later = None if s2r_mm is None else SimpleNamespace(error_mm=s2r_mm)
     figures = {"median_mm": median_mm, "p95_mm": p95_mm}
-    said = told(then, THEN, figures, monkeypatch, capsys, later=later)
+    said = advice(then, THEN, figures, monkeypatch, capsys, later=later)
     assert f"median: 0.30 mm on the arm of the training, {median_mm:.2f} mm on the later one" in said
     assert f"95 %: 0.80 mm on the arm of the training, {p95_mm:.2f} mm on the later one" in said
     assert f"about {max(s2r_mm or 0.0, 0.7):.2f} mm off" in said
@@ -64,18 +64,18 @@ def test_training_is_needed_where_errors_grow(median_mm, p95_mm, s2r_mm, enough,
 def test_a_run_from_demonstrations_goes_on_with_them(run_of, monkeypatch, capsys):
     then, shown = run_of("imitation", "pipe"), {"median_mm": 1.0, "max_mm": 3.0}
     command = f"python -m train imitate {then.path}/demonstrations.npz --agent {then.path} --calibration new"
-    assert f"{command} --preset pipe" in told(then, shown, shown | {"max_mm": 4.0}, monkeypatch, capsys)
+    assert f"{command} --preset pipe" in advice(then, shown, shown | {"max_mm": 4.0}, monkeypatch, capsys)
 
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_goals_are_corrected_at_rest_alone(moves, run_of, monkeypatch, capsys):
     then, limits = run_of("tqc", "payload"), []
     monkeypatch.setattr(EnvConfig, "moves", moves)
-    told(then, THEN, THEN, monkeypatch, capsys, limits=limits)
+    advice(then, THEN, THEN, monkeypatch, capsys, limits=limits)
     assert len(limits) == (0 if moves else 2) and all(np.array_equal(x, SHIFT_LIMIT) for x in limits)
 
 
-def told(then, old, new, monkeypatch, capsys, limits=None, later=None):
+def advice(then, old, new, monkeypatch, capsys, limits=None, later=None):
     """Advice by the figures of the run and of the later arm; collect the limits of shifts."""
     now, limits = renewed(then, then.arm._replace(s2r=later)), [] if limits is None else limits
 
@@ -98,7 +98,7 @@ def told(then, old, new, monkeypatch, capsys, limits=None, later=None):
 
     monkeypatch.setattr("train.runs.run.task_of_run", task_of)
     monkeypatch.setattr(Run, "policy", lambda run: None)
-    enough = told_enough(then, now, Path("new"), Console(width=400))
+    enough = policy_still_accurate(then, now, Path("new"), Console(width=400))
     said = " ".join(capsys.readouterr().out.split())
     assert enough == ("enough without training" in said and "NOT" not in said)
     return said

@@ -1,8 +1,13 @@
-"""Texts that training prints."""
+"""The loop of a run: what it prints, and arms that diverge."""
+
+import dataclasses
 
 import pytest
 
+from mjx_softarm.env import EnvConfig
+from tests.train.small import CONFIG
 from train.runs import run
+from train.runs.checkpoint import RunError
 
 
 @pytest.mark.parametrize(
@@ -16,3 +21,12 @@ from train.runs import run
 )
 def test_a_learner_s_success_has_one_meaning_in_all_epochs(row, text):
     assert run._success([row | {"env/reached": 0.5}] * 2) == text
+
+
+def test_an_epoch_in_which_most_arms_in_motion_diverge_ends_the_run_and_names_the_step():
+    moving = dataclasses.replace(CONFIG, env=EnvConfig(mode="dynamic", simulation_step_s=0.02))
+    run.refuse_divergence(moving, 8.0)
+    run.refuse_divergence(CONFIG, 16.0)  # at rest
+    message = rf"env\.simulation_step_s: got 0\.02, with which 9 of {moving.learner.n_env_steps(1)}"
+    with pytest.raises(RunError, match=message):
+        run.refuse_divergence(moving, 9.0)

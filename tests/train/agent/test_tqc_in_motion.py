@@ -8,9 +8,7 @@ import pytest
 
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
-from train.agent.networks import COST_AHEAD, Critics
-from train.agent.prediction import PredictiveCritics, Predictor
-from train.agent.tqc import TQCConfig
+from train.agent.tqc import COST_AHEAD, Critics, PredictiveCritics, Predictor, TQCConfig
 from train.config import TrainConfig
 
 B, ACTION, SENSED = 64, 2, 5
@@ -66,16 +64,16 @@ def test_a_taught_prediction_follows_the_arm_whatever_the_goal(critics, params, 
     start = (params, optimizer.init(params))
     (taught, _), _ = jax.lax.scan(step, start, None, length=400)
     assert critics.loss(taught, *batch) < 0.02 * critics.loss(params, *batch)
-    told = critics.after(taught["predictor"], obs, action)
+    predicted = critics.after(taught["predictor"], obs, action)
     moved = np.linalg.norm(after[:, ERROR] - obs[:, ERROR], axis=-1)
-    missed = np.linalg.norm(told[:, ERROR] - after[:, ERROR], axis=-1)
+    missed = np.linalg.norm(predicted[:, ERROR] - after[:, ERROR], axis=-1)
     assert np.median(missed) < 0.1 * np.median(moved)
-    np.testing.assert_array_equal(told[:, GOAL], obs[:, GOAL])
-    np.testing.assert_array_equal(told[:, -ACTION:], action)
+    np.testing.assert_array_equal(predicted[:, GOAL], obs[:, GOAL])
+    np.testing.assert_array_equal(predicted[:, -ACTION:], action)
     # Another goal changes the error, not what the arm does.
     other = obs.at[:, GOAL].add(1.0).at[:, ERROR].add(-0.3)
     elsewhere = critics.after(taught["predictor"], other, action)
-    np.testing.assert_allclose(elsewhere[:, ERROR] - told[:, ERROR], -0.3, atol=1e-6)
+    np.testing.assert_allclose(elsewhere[:, ERROR] - predicted[:, ERROR], -0.3, atol=1e-6)
 
 
 def test_the_quantiles_fall_with_the_predicted_errors(critics, params, batch):

@@ -1,0 +1,252 @@
+"""Sweeps: a member is the ordinary run, all are traced once, and a killed sweep ends with the same bits."""
+
+import dataclasses
+import io
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+from calib.arm import CalibratedArm
+from mjx_softarm._support.provenance import write_json
+from mjx_softarm.env import EnvConfig, ReachEnv
+from tests.train import small
+from tests.train.small import SHORT, new_job
+from train import sweep
+from train.__main__ import main
+from train.config import ConfigError, override
+from train.epoch.job import Job
+from train.presets import PRESETS
+from train.runs import plots
+from train.runs.checkpoint import Checkpoints, RunError
+from train.runs.evaluate import Summary
+from train.runs.folder import Run
+from train.runs.task import Task
+from train.sweep import RESULTS_FILE, MembersEpoch, members_of, open_members, report, setting, variable
+
+CONFIG = dataclasses.replace(
+    small.CONFIG,
+    evaluation_epochs=2,
+    env=EnvConfig(engine="chain", n_poses=64),
+    learner=dataclasses.replace(small.LEARNER, target_entropy=-9.0),
+)
+# Each setting that may be varied, at another value.
+OTHER = [
+    "learner.learning_rate=1e-2",
+    "learner.learning_rate_alpha=3e-2",
+    "learner.gamma=0.7",
+    "learner.tau=0.1",
+    "learner.initial_alpha=0.3",
+    "learner.target_entropy=-20.0",
+    "learner.reward_scale=0.1",
+    "learner.hindsight.reached_share=0.2",
+    "learner.hindsight.near_share=0.6",
+    "env.reward.goal_bonus=30.0",
+    "env.reward.error_cost=4.0",
+    "env.reward.step_cost=0.7",
+    "env.reward.saturation_cost=20.0",
+    "env.reward.threshold=0.2",
+    "env.reward.weight_per_mm=0.003",
+    "env.reward.distance_cost=2.0",
+    "env.reward.weight_per_deg=0.004",
+]
+VARIABLE = variable(CONFIG)
+N_EPOCHS = 5
+AT_REST = [field.name for field in dataclasses.fields(Summary) if field.default is dataclasses.MISSING]
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
+
+@pytest.fixture(scope="module")
+def env():
+    return ReachEnv(SHORT, CONFIG.env)
+
+
+@pytest.fixture(scope="module")
+def members():
+    return {"first": CONFIG, "other": override(CONFIG, [*OTHER, "seed=3"])}
+
+
+@pytest.fixture(scope="module")
+def job(env):
+    return Job(MembersEpoch(CONFIG, env))
+
+
+@pytest.fixture(scope="module")
+def given(members):
+    """Keys and numbers of the members."""
+    numbers = {name: jnp.asarray([setting(c, name) for c in members.values()]) for name in VARIABLE}
+    return jnp.stack([jax.random.PRNGKey(config.seed) for config in members.values()]), numbers
+
+
+@pytest.fixture(scope="module")
+def trained(job, given):
+    """States after some epochs, and the metrics of all of them."""
+    states, metrics = job.init(given), []
+    for _ in range(N_EPOCHS):
+        states, row = job.epoch(states)
+        metrics.append(jax.device_get(row))
+    return states, metrics
+
+
+def test_each_setting_that_may_be_varied_is_looked_at(members):
+    assert {assignment.partition("=")[0] for assignment in OTHER} == set(VARIABLE)
+    assert all(setting(members["first"], path) != setting(members["other"], path) for path in VARIABLE)
+
+
+def test_a_member_is_the_ordinary_run(members, trained):
+    states, metrics = trained
+    config, other_env = members["other"], ReachEnv(SHORT, members["other"].env)
+    alone = new_job(config, other_env)
+    state = alone.init(jax.random.PRNGKey(config.seed))
+    for row in metrics:
+        state, expected = alone.epoch(state)
+        for name, value in expected.items():
+            np.testing.assert_allclose(row[name][1], value, rtol=2e-4, atol=2e-5, err_msg=name)
+    first, member = states.member(0), states.member(1)
+    assert int(member.n_epochs) == N_EPOCHS and config.learner.n_updates(N_EPOCHS) > 0
+    shape_of = lambda x: (x.shape, x.dtype)  # noqa: E731
+    assert jax.tree.map(shape_of, member) == jax.tree.map(shape_of, state)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4)  # noqa: E731
+    jax.tree.map(close, member, state)
+    with pytest.raises(AssertionError):  # the comparison can tell members apart
+        jax.tree.map(close, first.learner, state.learner)
+
+
+def test_a_sweep_is_traced_once_and_warms_up_without_updates(job, trained):
+    states, metrics = trained
+    assert job.n_traces == 1
+    assert (metrics[0]["tqc/critic_loss"] == 0).all() and (metrics[1]["tqc/critic_loss"] > 0).all()
+    # A branch on a number of each member would have become a select, with both of its sides computed.
+    program = job._epoch.lower(states, job.env.pool).as_text()
+    assert program.count("stablehlo.case") == 1
+
+
+class MadeUp:
+    """Figures that depend on every parameter of an actor."""
+
+    def __init__(self, actor_params):
+        self.size = float(sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(actor_params)))
+
+    def to_dict(self):
+        return dict.fromkeys(AT_REST, self.size)
+
+
+@pytest.fixture
+def ready(env, job, monkeypatch):
+    """Sweeps of the members train with the compiled job, and are evaluated by made-up figures."""
+    evaluate = lambda actor_params: (MadeUp(actor_params),)  # noqa: E731
+    task = Task(job=None, evaluate=evaluate, prepare=lambda state, epoch: state)
+    monkeypatch.setattr(plots, "pictures", lambda rows: {})
+    monkeypatch.setattr(sweep, "ReachEnv", lambda spec, config, s2r: env)
+    monkeypatch.setattr(sweep, "Job", lambda epoch, pool_of: job)
+    monkeypatch.setattr(sweep, "task_of", lambda config, env: task)
+
+
+def dying(checkpoints, epoch, *rest, save=Checkpoints.save):
+    """Saves until the second member is to be saved after the sixth epoch."""
+    if epoch == 6 and Run.open(checkpoints.run).config.seed == 3:
+        raise KeyboardInterrupt
+    save(checkpoints, epoch, *rest)
+
+
+def create(path, members):
+    return [Run.create(path / name, config, CalibratedArm(SHORT)) for name, config in members.items()]
+
+
+def test_a_stopped_sweep_ends_with_the_same_bits(ready, job, given, members, tmp_path, monkeypatch):
+    console = Console(file=io.StringIO())
+    paths = [tmp_path / name for name in ("whole", "stopped")]
+    whole, stopped = (create(path, members) for path in paths)
+    sweep.train(paths[0], whole, console)
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", dying)
+        with pytest.raises(KeyboardInterrupt):
+            sweep.train(paths[1], stopped, console)
+    resumed = open_members(paths[1])
+    assert [run.config for run in resumed] == list(members.values())
+    assert [run.checkpoints.epochs for run in resumed] == [[4, 6], [2, 4]]
+    sweep.train(paths[1], resumed, console)
+    assert "continuing after epoch 4 of 8" in console.file.getvalue()
+
+    like = jax.eval_shape(lambda states: states.member(0), job.shapes(given))
+    for one, other in zip(whole, resumed, strict=True):
+        (epoch, expected), (resumed_epoch, got) = (run.checkpoints.restore(like) for run in (one, other))
+        assert epoch == resumed_epoch == 8
+        jax.tree.map(np.testing.assert_array_equal, jax.device_get(expected), jax.device_get(got))
+        rows = [
+            [{k: x for k, x in row.items() if "speed" not in k} for row in r.metrics()] for r in (one, other)
+        ]
+        assert rows[0] == rows[1] and [row["epoch"] for row in rows[0]] == list(range(1, 9))
+        assert ["evaluation/median_mm" in row for row in rows[0]] == [False, True] * 4
+
+
+@pytest.mark.slow
+def test_a_sweep_as_a_user_runs_it(tmp_path, capsys):
+    SHORT.to_toml(arm := tmp_path / "arm.toml")
+    path = tmp_path / "whole"
+    command = ["sweep", *small.flags(), "--evaluation-epochs=4", "--spec", str(arm), "--seeds", "4,5"]
+    command += ["--vary", "env.reward.goal_bonus=50,90"]
+    assert main([*command, "--out", str(path)]) == 0
+    results = json.loads((path / RESULTS_FILE).read_text())["groups"]
+    assert [len(rows) for rows in results.values()] == [2, 2]
+    member = path / "seed4-env.reward.goal_bonus=90"
+    figures = (member / "evaluation.json").read_text()
+    assert main(["evaluate", str(member)]) == 0
+    assert (member / "evaluation.json").read_text() == figures
+    capsys.readouterr()
+    assert main([*command, "--out", str(path)]) == 2
+    assert "which exists, expected a new folder, or --resume" in capsys.readouterr().err
+
+
+def test_members_are_the_product_of_seeds_and_values():
+    members = members_of(PRESETS["quick"], (0, 7), ["learner.gamma=0.5, 0.9", "env.reward.goal-bonus=50"])
+    assert {name: (c.seed, c.learner.gamma, c.env.reward.goal_bonus) for name, c in members.items()} == {
+        "seed0-learner.gamma=0.5-env.reward.goal_bonus=50": (0, 0.5, 50.0),
+        "seed0-learner.gamma=0.9-env.reward.goal_bonus=50": (0, 0.9, 50.0),
+        "seed7-learner.gamma=0.5-env.reward.goal_bonus=50": (7, 0.5, 50.0),
+        "seed7-learner.gamma=0.9-env.reward.goal_bonus=50": (7, 0.9, 50.0),
+    }
+
+
+def test_the_table_has_mean_least_and_greatest_over_the_seeds(tmp_path):
+    """Two seeds and two settings with figures made up; a member without figures is named."""
+    create(tmp_path, members_of(CONFIG, (0, 1), ["learner.gamma=0.5,0.9"]))
+    runs = open_members(tmp_path)
+    with pytest.raises(RunError, match="got no evaluation.json, expected a finished run"):
+        report(tmp_path, runs)
+    medians = {(0, 0.5): 2.0, (1, 0.5): 5.0, (0, 0.9): 6.0, (1, 0.9): 8.0}
+    for run in runs:
+        median_mm = medians[run.config.seed, run.config.learner.gamma]
+        figures = dict.fromkeys(AT_REST, 0.0) | {"median_mm": median_mm, "reached_share": 0.25}
+        write_json(run.path / "evaluation.json", figures)
+    labels, *columns = report(tmp_path, runs).columns
+    assert [each.header for each in columns] == ["learner.gamma=0.5", "learner.gamma=0.9"]
+    shown = dict(zip(labels.cells, zip(*(column.cells for column in columns), strict=True), strict=True))
+    assert shown["tip error, median mm"] == ("3.50 (2.00 to 5.00)", "7.00 (6.00 to 8.00)")
+    assert shown["goals reached %"] == ("25.0 (25.0 to 25.0)",) * 2 and len(shown) == len(AT_REST)
+    groups = json.loads((tmp_path / RESULTS_FILE).read_text())["groups"]
+    assert [row["median_mm"] for row in groups["learner.gamma=0.9"]] == [6.0, 8.0]
+
+
+@pytest.mark.parametrize(
+    "vary, message",
+    [
+        (["learner.n_arms=64,128"], "--vary: got 'learner.n_arms=64,128', expected .* each of learner.learn"),
+        (["learner.gamma=0.5,1.5"], "learner.gamma: got 1.5"),
+        (["learner.target_entropy=null"], "--vary learner.target_entropy: got None, expected numbers"),
+        (["learner.gamma=0.5", "learner.gamma=0.6"], "got 'learner.gamma=0.6', expected .* once"),
+    ],
+)
+def test_what_cannot_be_varied_is_refused_by_name(vary, message):
+    with pytest.raises(ConfigError, match=message):
+        members_of(PRESETS["quick"], (0,), vary)
+
+
+def test_a_folder_that_is_no_sweep_is_named_and_resume_goes_alone(tmp_path, capsys):
+    with pytest.raises(RunError, match="got no folder of a run in it, expected the folder of a sweep"):
+        open_members(tmp_path)
+    assert main(["sweep", "--resume", "x", "--seeds", "1"]) == 2
+    assert "--resume x: got --seeds too, expected none" in capsys.readouterr().err

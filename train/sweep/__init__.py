@@ -1,1 +1,0 @@
-"""Sweeps: several runs trained as one job."""
