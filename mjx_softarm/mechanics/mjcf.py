@@ -91,15 +91,18 @@ def build_model(spec: ArmSpec) -> mujoco.MjModel:
     return build_spec(spec).compile()
 
 
+def loaded(model: mjx.Model, link_mass_kg: Array, tool_mass_kg: Array) -> mjx.Model:
+    """Return a model on the device with the masses of `ArmParams`."""
+    mass = jnp.concatenate([jnp.zeros(1), link_mass_kg, tool_mass_kg])
+    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
+    return model.replace(body_mass=mass, body_inertia=model.body_inertia * scale[:, None])
+
+
 def episode_model(model: mjx.Model, params: ArmParams) -> mjx.Model:
     """Return a model on the device with the masses and the tendons' stiffnesses of `params`."""
-    mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
-    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
-    return model.replace(
-        body_mass=mass,
-        body_inertia=model.body_inertia * scale[:, None],
-        tendon_stiffness=jnp.concatenate([params.chamber_stiffness, params.spring_stiffness]),
-    )
+    model = loaded(model, params.link_mass_kg, params.tool_mass_kg)
+    stiffness = jnp.concatenate([params.chamber_stiffness, params.spring_stiffness])
+    return model.replace(tendon_stiffness=stiffness)
 
 
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):

@@ -35,6 +35,7 @@ from mjx_softarm._support.lazy import mjx
 from mjx_softarm._support.small_matrices import products
 from mjx_softarm.mechanics.chain_hessian import ChainHessian, solve_approximate_gradient
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
+from mjx_softarm.mechanics.mjcf import loaded
 from mjx_softarm.mechanics.motion.state import (
     Motion,
     MotionEnd,
@@ -43,7 +44,6 @@ from mjx_softarm.mechanics.motion.state import (
     Path,
     friction_damping,
     in_force,
-    loaded,
     pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2, ArmParams

@@ -29,7 +29,7 @@ from jax import Array
 from mjx_softarm import control, pneumatics
 from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.kinematics import frames_of
-from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
+from mjx_softarm.mechanics.mjcf import chamber_lengths, episode_model, spring_lengths
 from mjx_softarm.mechanics.motion.state import (
     Motion,
     MotionEnd,
@@ -37,7 +37,6 @@ from mjx_softarm.mechanics.motion.state import (
     Path,
     friction_damping,
     in_force,
-    loaded,
     pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2
@@ -114,10 +113,8 @@ def advance(
 
 def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
     """Return the model with time step h [s] and the arm's own masses, stiffnesses and dampers."""
-    params = arm.params
-    model = loaded(arm.model, params.link_mass_kg, params.tool_mass_kg)
+    model = episode_model(arm.model, arm.params)
     return model.replace(
-        tendon_stiffness=jnp.concatenate([params.chamber_stiffness, params.spring_stiffness]),
         tendon_damping=arm.own.damping * model.tendon_damping,
         dof_damping=arm.own.damping * model.dof_damping,
         opt=model.opt.replace(timestep=jnp.float32(h)),

@@ -123,13 +123,6 @@ class MovingArm(NamedTuple):
     own: MotionParams
 
 
-def loaded(model: mjx.Model, link_mass_kg: Array, tool_mass_kg: Array) -> mjx.Model:
-    """Return a model with the masses of `ArmParams`."""
-    mass = jnp.concatenate([jnp.zeros(1), link_mass_kg, tool_mass_kg])
-    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
-    return model.replace(body_mass=mass, body_inertia=model.body_inertia * scale[:, None])
-
-
 def n_earlier(delay_s: float, period_s: float) -> int:
     """Return the number of commands before the last one that a dead time of up to delay_s keeps waiting."""
     return max(math.ceil(delay_s / period_s - 1e-6) - 1, 0)
