@@ -1,1 +1,1 @@
-"""Training jobs for the soft arm: agents, replay, rollouts. Run from the checkout, not part of the wheel."""
+"""Training jobs for the soft arm: agents, replay, rollouts."""

@@ -108,7 +108,8 @@ def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -
     # Read the values of each varied number.
     values: dict[str, list[str]] = {}
     for assignment in vary:
-        path, _, text = assignment.replace("-", "_").partition("=")
+        path, _, text = assignment.partition("=")
+        path = path.replace("-", "_")
         if not text or path not in variable(config) or path in values:
             names = ", ".join(variable(config))
             raise ConfigError(f"--vary: got {assignment!r}, expected NAME=VALUE,... once for each of {names}")

@@ -34,7 +34,7 @@ OBJECTS_KG = {"as shown": (BALL_KG, APPLE_KG), "exchanged": (APPLE_KG, BALL_KG)}
 
 
 class TrialOutcome(NamedTuple):
-    """Outcome of a trial with p goals and t ticks, on an arm with n springs; NaN where a goal was missed."""
+    """Outcome of a trial with p goals and t ticks, on an arm with n chambers; NaN where a goal was missed."""
 
     goal: np.ndarray  # (p, 6) [mm, deg]
     name: np.ndarray  # (p,) text, such as "pick left"

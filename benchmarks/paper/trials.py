@@ -92,7 +92,6 @@ KINDS = {
     "payload": Kind("with S2R, payload", "payload"),
     "quick": Kind("with S2R, quick", "quick"),
     "motion": Kind("with S2R, motion", "motion"),
-    "motion-analytic": Kind("with S2R, motion-analytic", "motion-analytic"),
     # Pipes
     "pipe": Kind("learned reward", "pipe", "pipe300"),
     "hand-made": Kind("hand-made reward", "pipe", "pipe300", HAND_MADE),
@@ -102,7 +101,7 @@ KINDS = {
     "narrowest": Kind("learned reward", "pipe", "pipe200"),
     "narrowest-hand-made": Kind("hand-made reward", "pipe", "pipe200", HAND_MADE),
 }
-BESIDE = ("payload", "quick", "motion", "motion-analytic")
+BESIDE = ("payload", "quick", "motion")
 PIPE_KINDS = tuple(name for name, kind in KINDS.items() if kind.task)
 
 PolicyKey = tuple[str, int, int]  # kind, twin, seed

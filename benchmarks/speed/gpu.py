@@ -30,8 +30,8 @@ LEVELS_MM = (5.0, 2.0, 1.0)  # median errors at held-out goals that a training i
 STEPS = {
     ("chain", "quasistatic"): (1024, 8192, 65_536),
     ("mjx", "quasistatic"): (1024, 8192),
-    ("chain", "dynamic"): (1024, 8192, 65_536),
     ("mjx", "dynamic"): (1024, 8192, 65_536),
+    ("mjx-step", "dynamic"): (1024, 8192, 65_536),
     ("warp", "dynamic"): (1024, 8192, 65_536),
 }
 # Presets, and pairs of arms and transitions in a batch

@@ -71,7 +71,8 @@ Arm = Annotated[
     tyro.conf.arg(
         help="yours: package.module:Class, or a file of hardware, wiring.toml; simulated: twin:SEED, or "
         "twin:rod:SEED; twin:SEED@ARM.toml, of another arm; twin:SEED:pipe300, in a pipe; "
-        "twin:SEED:aged, later; twin:SEED:exact, as specified; twin:SEED:500g, with a payload"
+        "twin:SEED:aged, later; twin:SEED:exact, as specified; twin:SEED:lost4, with chamber 4 burst; "
+        "twin:SEED:500g, with a payload"
     ),
 ]
 

@@ -1,29 +1,29 @@
 """Safety: the faults of an arm, how each is detected, and the control loop's response.
 
-    fault              detected by                                                      response
-    LOST_READING       a spring without a length this tick, or no readings in time      go on with the last
-    SENSOR_LOST        a spring lost in LOST_TICKS ticks in a row                     vent
-    SENSOR_STUCK       a spring that stands still, without its noise even, while its    vent
-                       chamber is driven or a spring of its section moves
-    CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
-                       arm in the shape of one without that pressure: for a second, or
-                       for three while it moves
-    GOAL_OUTSIDE       a goal that no pressures bring the tip to, by the policy's       skip the goal
-                       models and its threshold of a goal; a pilot's goal further
-                       from all reachable poses than they are from each other
-    MISSED_DEADLINE    a tick longer than the period, or pressures not taken in time    go on
-    ARM_LATE           LATE_TICKS of these in a row                                   vent
-    ARM_LOST           the driver cannot reach sensors or pumps, or refuses pressures   vent
-    NOT_SETTLED        springs neither on their references nor at rest at a limit       go on and act
-                       within SETTLE_TIMEOUT_S
-    SATURATED          a chamber at its limit with its spring off the reference         go on
-    EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
-    LOAD_LOST          a new average of the payload begins lower: an object dropped     go on
-    OVERLOADED         a payload whose whole interval is above OVERLOAD times the       go on
-                       largest
-    LOAD_UNKNOWN       springs and pressures that no payload explains, or a calibration go on
-                       that knows none better than KNOWN:       the pose is estimated
-                       from the springs alone, with the payload believed before
+    fault            detected by                                                       response
+    LOST_READING     a spring without a length this tick, or no readings in time       go on with the last
+    SENSOR_LOST      a spring lost in LOST_TICKS ticks in a row                        vent
+    SENSOR_STUCK     a spring that stands still, without its noise even, while its     vent
+                     chamber is driven or a spring of its section moves
+    CHAMBER_LOST     a chamber at its limit, its spring off the reference, and the     vent
+                     arm in the shape of one without that pressure: for a second, or
+                     for three while it moves
+    GOAL_OUTSIDE     a goal that no pressures bring the tip to, by the policy's        skip the goal
+                     models and its threshold; a goal at run time further from all
+                     reachable poses than they are from each other
+    MISSED_DEADLINE  a tick longer than the period, or pressures not taken in time     go on
+    ARM_LATE         LATE_TICKS of these in a row                                      vent
+    ARM_LOST         the driver cannot reach sensors or pumps, or refuses pressures    vent
+    NOT_SETTLED      springs neither on their references nor at rest at a limit        go on and act
+                     within SETTLE_TIMEOUT_S
+    SATURATED        a chamber at its limit with its spring off the reference          go on
+    EXTRAPOLATION    the sim-to-real network asked far from its training rows          go on
+    LOAD_LOST        a new average of the payload begins lower: an object dropped      go on
+    OVERLOADED       a payload whose whole interval is above OVERLOAD times the        go on
+                     largest
+    LOAD_UNKNOWN     springs and pressures that no payload explains: the               go on
+                     specification's payload is taken; or an interval wider than the
+                     calibration's limit: the payload believed before stays
 
 Names in capitals are constants, here and where they are imported from. To vent is to end the run and
 bring all pressures to zero along a ramp, as at every end of a run (`mjx_softarm.deploy.ending`). Every fault

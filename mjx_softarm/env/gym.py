@@ -1,7 +1,7 @@
 """Gymnasium environments: many arms as one vector environment, or a single arm.
 
     envs = gymnasium.make_vec("mjx_softarm.env.gym:SoftArmReach-v0", num_envs=64)
-    env = gymnasium.make("mjx_softarm.env.gym:SoftArmReach-v0", config=EnvConfig(engine="mjx"))
+    env = gymnasium.make("mjx_softarm.env.gym:SoftArmReach-v0", config=EnvConfig(observation="payload"))
 
 Both are the `ReachEnv` of `mjx_softarm.env`, compiled, with NumPy arrays going in and out. An info holds
 
@@ -138,9 +138,9 @@ class SoftArmEnv(gymnasium.Env):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("SoftArmEnv.step: got no episode, expected reset first")
         self._state = state = self._step_arm(self._state, _as_actions(action, self.action_space.shape))
-        obs, reward, info = _to_numpy((state.obs, state.reward, _step_info(state)))
+        obs, reward, done, info = _to_numpy((state.obs, state.reward, state.done, _step_info(state)))
         info = {name: value if value.ndim else value.item() for name, value in info.items()}
-        return obs, reward.item(), info["is_success"], not info["valid"], info
+        return obs, reward.item(), bool(done > 0) and info["valid"], not info["valid"], info
 
 
 def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm._support.lazy import brax_envs
-from mjx_softarm.env.config import EnvConfig, Randomisation
+from mjx_softarm.env.config import EnvConfig
 from mjx_softarm.mechanics.motion.state import Motion, MotionParams, n_earlier
 from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.pneumatics import Regulator
@@ -77,12 +76,6 @@ class EpisodeMotion:
         longest_s = spread * float(np.max(own.delay_s)) + self._spread.delay_max_s
         self.n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.moves else 0
         self._offset_kpa = self._actuators.rest_offset_kpa if config.moves else None
-
-    def spread_by(self, spread: Randomisation) -> EpisodeMotion:
-        """Return the same arms with another spread, whose numbers may be traced; as many commands wait."""
-        other = copy.copy(self)
-        other._spread = spread
-        return other
 
     def params(self, share: Array | None) -> MotionParams:
         """Return the parameters of an episode.

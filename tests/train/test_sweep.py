@@ -211,6 +211,13 @@ def test_members_are_the_product_of_seeds_and_values():
     }
 
 
+def test_values_may_have_signs_and_exponents():
+    vary = ["learner.learning-rate=1e-3,3e-4", "learner.target-entropy=-30,-20"]
+    learners = [config.learner for config in members_of(CONFIG, (0,), vary).values()]
+    rates = [(learner.learning_rate, learner.target_entropy) for learner in learners]
+    assert rates == [(1e-3, -30.0), (1e-3, -20.0), (3e-4, -30.0), (3e-4, -20.0)]
+
+
 def test_the_table_has_mean_least_and_greatest_over_the_seeds(tmp_path):
     """Two seeds and two settings with figures made up; a member without figures is named."""
     create(tmp_path, members_of(CONFIG, (0, 1), ["learner.gamma=0.5,0.9"]))

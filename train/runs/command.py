@@ -17,6 +17,7 @@ from rich.table import Table
 from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.env.config import ENGINES
 from train.agent.imitation import ImitationConfig
 from train.config import ConfigError, TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
@@ -36,8 +37,8 @@ class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""
 
     agent: cli.MaybePath = None
-    """run whose policy this one begins with, and whose critics if both learn by TQC. The widths of its hidden
-    layers are taken, too"""
+    """run whose policy this one begins with: one of TQC, with its critics; for analytic any run. The widths of
+    its hidden layers are taken, too"""
     devices: Devices = None
 
     def __call__(self) -> int:
@@ -135,7 +136,8 @@ def evaluate(
     if payload:
         how, name = f"{how}, {payload:g} g", f"{name}-{payload:g}g"
     if in_motion is not None:
-        config = dataclasses.replace(config, mode="dynamic", dynamic_step_s=in_motion)
+        engine = config.engine if config.engine in ENGINES["dynamic"] else "mjx"
+        config = dataclasses.replace(config, engine=engine, mode="dynamic", dynamic_step_s=in_motion)
         how, name = (
             f"{how}, {in_motion:g} s an action, in motion",
             f"{name}-in-motion-{n_actions}x{in_motion:g}s",

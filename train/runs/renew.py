@@ -67,7 +67,7 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
     if all(np.hypot(new[name], models_mm) <= ENOUGH * np.hypot(old[name], models_mm) for name in old):
         console.print("enough without training")
         return True
-    # The command that goes on, with the settings that the run began with
+    # The command that goes on, with the preset that the run began with; further settings are the user's
     shown = learns_from_demonstrations(before.config.learner)
     task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if shown else "reach"
     preset = before.origin()["preset"]

@@ -1,4 +1,4 @@
-"""The engine "chain" in motion: MJX's equation of motion, stepped at the control rate.
+"""The engine "mjx" in motion: MJX's equation of motion, stepped at the control rate.
 
     M(q) dv/dt + c(q, v) + D v + dV/dq = 0,    dq/dt = v
 

@@ -12,7 +12,7 @@ from train.presets import PRESETS
 
 
 def test_each_size_has_a_row_and_a_program_that_failed_says_why(monkeypatch):
-    monkeypatch.setattr(gpu, "STEPS", {("chain", "dynamic"): (8, 64)})
+    monkeypatch.setattr(gpu, "STEPS", {("mjx", "dynamic"): (8, 64)})
     monkeypatch.setattr(gpu, "LEARNERS", {"quick": ((8, 4),)})
 
     def take_turns(workers, n_rounds, n_starting):
@@ -23,8 +23,8 @@ def test_each_size_has_a_row_and_a_program_that_failed_says_why(monkeypatch):
     monkeypatch.setattr(gpu, "take_turns", take_turns)
     found = gpu.speed()
     assert found["env_steps"] == [
-        {"engine": "chain", "mode": "dynamic", "arms": 8, "failed": "out of memory"},
-        {"engine": "chain", "mode": "dynamic", "arms": 64, "env_steps_per_s": 1500},
+        {"engine": "mjx", "mode": "dynamic", "arms": 8, "failed": "out of memory"},
+        {"engine": "mjx", "mode": "dynamic", "arms": 64, "env_steps_per_s": 1500},
     ]
     assert found["learning"] == [{"preset": "quick", "arms": 8, "batch": 4, "env_steps_per_s": 1500}]
 
