@@ -136,7 +136,7 @@ def of_this_machine(
     n_devices = n_devices if devices or on_cpu else 1
     sizes = arms or (64, 1024, 8192, *(() if on_cpu else (65_536,)))
     xla.enable_compilation_cache()
-    console, rows = Console(highlight=False), list[dict[str, Any]]()
+    console, rows = Console(highlight=False, markup=False), list[dict[str, Any]]()
     name = machine_kind()
     console.print(f"{name}; {n_devices} device{'s' * (n_devices > 1)}\n{HEAD}", soft_wrap=True)
     for point in (Point(*pair, n) for n in sizes for pair in pairs):

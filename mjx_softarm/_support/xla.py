@@ -106,7 +106,8 @@ def rows_last(function: Callable, n_at_once: int | None = None, n_shared: int = 
 
         def chunk(row: Any) -> Any:
             def last(k: int, x: Any, is_batched: bool) -> jax.Array:
-                x = jnp.moveaxis(x[row], 0, -1) if is_batched else jnp.asarray(x)[..., None]
+                x = jnp.asarray(x)
+                x = jnp.moveaxis(x[row], 0, -1) if is_batched else x[..., None]
                 return jnp.broadcast_to(x, (*x.shape[:-1], size)) if k < len(arguments) - n_shared else x
 
             pairs = enumerate(zip(arguments, batched, strict=True))

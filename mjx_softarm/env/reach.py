@@ -247,10 +247,10 @@ class ReachEnv(brax_envs.Env):
         if config.moves:
             moving = MovingArm(self.model, self._data, params, arm.moving)
             times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
-            told = moving, arm.motion, reference_m, self.gains, *times_s
+            arguments = moving, arm.motion, reference_m, self.gains, *times_s
             if config.engine == "mjx":
-                return midpoint.advance(*told, self.n_at_once)
-            return mjx_step.advance(*told)
+                return midpoint.advance(*arguments, self.n_at_once)
+            return mjx_step.advance(*arguments)
         end = settle(params, reference_m, self.n_at_once)
         if config.engine == "mjx":
             end = mjx_rest.measured(self.model, self._data, params, end)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
@@ -100,7 +101,8 @@ def test_a_benchmark(changed):
 def test_tqc_swings_pendulums_up():
     page = {"__name__": "page"}
     exec(block("TQC on an environment of yours", "python"), page)
-    key = page["jax"].random.key(1)
+    keys = page["jax"].random.split(page["jax"].random.key(1), 8)
     policy, reward = page["train"](1500, page["jax"].random.key(0))
     before = reward[: page["EPISODE"]].sum(axis=0).mean()  # random actions for half of the episode
-    assert before < -700.0 and page["returns"](policy, key).mean() > -300.0  # random: -1,200
+    after = np.mean([page["returns"](policy, key) for key in keys])  # 32 episodes: single ones differ by 300
+    assert before < -700.0 and after > -400.0  # random: -1,200

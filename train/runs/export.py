@@ -90,7 +90,7 @@ def export(
     others = {"--out": out, "--onnx": onnx, "--cpp": cpp, "--calibration": calibration}
     if weights and (given := [name for name, value in others.items() if value]):
         raise RunError(f"--weights: got {' and '.join(given)} too, expected it alone")
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
     if not weights:
         n_enough = sum(_export(path, out, onnx, cpp, calibration, console) for path in folders)
         return 0 if n_enough == len(folders) else 1

@@ -96,8 +96,8 @@ def advance(
     run = jax.custom_vjp(lambda start, constants: forward(start, constants)[0])
 
     def forward_keeping(start: tuple[Motion, Array], constants: _Constants) -> tuple[Any, Any]:
-        found, kept = forward(start, constants)
-        return found, (kept, constants)
+        results, kept = forward(start, constants)
+        return results, (kept, constants)
 
     run.defvjp(forward_keeping, lambda given, change: (back(change, *given), None))
     end, last, path = run((motion, reference_m), _Constants(gains, arm.params, arm.own))
@@ -165,9 +165,9 @@ def _tick(
     seen, arms = _look(params, motion.q), reference_m.ndim - 1
 
     # The law takes arms first
-    told: Any = reference_m, seen.spring_m, motion.law, gains
-    told = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), told) if arms else told
-    command, law = control.pressures(*told, dt_s=period_s)
+    law_inputs: Any = reference_m, seen.spring_m, motion.law, gains
+    law_inputs = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), law_inputs) if arms else law_inputs
+    command, law = control.pressures(*law_inputs, dt_s=period_s)
     command, law = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (command, law)) if arms else (command, law)
 
     earlier = pushed(motion.earlier_kpa, motion.command_kpa)
@@ -185,8 +185,8 @@ def _look(params: ArmParams, q: Array) -> Path:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _sloped(change: Callable, value: Any, x: Any, here: Any) -> Any:
-    """Return a value whose derivative along dx is `change(here, dx)`, whatever it was computed from."""
+def _sloped(change: Callable, value: Any, x: Any, context: Any) -> Any:
+    """Return a value whose derivative along dx is `change(context, dx)`, whatever it was computed from."""
     return value
 
 
@@ -207,8 +207,8 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     v, params = motion.velocity, arm.params
     half_way = 0.5 * h * v  # (nv, *arms)
     q = motion.q + half_way
-    frames, here = _at(params, jax.lax.stop_gradient(q))
-    lines = _sloped(Tendons.changed, here, q, here)
+    frames, tendons = _at(params, jax.lax.stop_gradient(q))
+    lines = _sloped(Tendons.changed, tendons, q, tendons)
     chambers, _ = chambers_and_springs(lines, params)
     n_sections, n_chambers, *arms = len(lines.length), *chambers.length.shape
 
@@ -235,7 +235,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     pressure_kpa = pneumatics.pressure_of(gas_m3, middle_m3)
 
     # Forces in the middle: of the potential, of dampers and of inertia
-    constant = jax.lax.stop_gradient((here, frames, q, pressure_kpa))
+    constant = jax.lax.stop_gradient((tendons, frames, q, pressure_kpa))
     potential, (mass, bias) = statics_of(*constant, params), inertia(arm, frames, jax.lax.stop_gradient(v))
     gradient = _sloped(Statics.changed, potential.gradient, (q, pressure_kpa), potential)
     rate = rates(lines.jacobian, v)

@@ -203,6 +203,7 @@ def test_a_table_of_this_machine_and_its_file(options, tmp_path, capsys, monkeyp
     file = tmp_path / "speed.json"
     assert main(["throughput", "--arms", "8", "16", "--seconds", "0.01", "--json", str(file), *options]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[1][:5] == ["engine", "mode", "arms", "compile", "[s]"]
     assert ["chain", "quasistatic", "8", "1.5", "20,000", "300"] in lines
     written = json.loads(file.read_text())
     assert [(row["arms"], row["compile_s"]) for row in written["rows"]] == [(8, 1.5), (16, 1.5)]
