@@ -174,7 +174,7 @@ def s2r_errors(measurements: Measurements, arm: CalibratedArm, seed: int = 0) ->
     """Return errors of tips at the held-out poses of a calibration's network.
 
     Args:
-        measurements: measurements of the calibration.
+        measurements: measurements of the calibration, of all of its logs: others hold out other poses.
         arm: calibrated arm, with its network.
         seed: seed of the calibration.
 

@@ -27,7 +27,7 @@ def demo(tmp_path_factory):
     """Logs of the planted arm of seed 0, fewer than the command writes."""
     folder = tmp_path_factory.mktemp("demo") / "logs"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calib.demo, "N_POSES", 200)
+        patch.setattr(calib.demo, "N_POSES", 300)
         patch.setattr(calib.demo, "N_STEPS", 3)
         files = write_demo(folder, ArmSpec.default(), seed=0)
     return [str(file) for file in files]
@@ -37,7 +37,7 @@ def demo(tmp_path_factory):
 def calibrated(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("calib.fit.s2r.N_POINTS", 3_000)
+        patch.setattr("calib.fit.s2r.N_POINTS", 6_000)
         schedule = network.OF_PROCESS.schedule._replace(n_updates=2_000)
         patch.setattr(network, "OF_PROCESS", dataclasses.replace(network.OF_PROCESS, schedule=schedule))
         status = main(["run", *demo, "--out", str(folder)])
@@ -85,7 +85,8 @@ def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated)
 
 def test_the_paper_s_network_is_judged_at_the_poses_of_the_report(demo, calibrated):
     arm = CalibratedArm.read(calibrated[1])
-    errors = s2r_errors(measure([read_log(demo[1], arm.spec)[0]], arm.spec), arm)
+    logs = [read_log(file, arm.spec)[0] for file in demo]
+    errors = s2r_errors(measure(logs, arm.spec), arm)
     report = json.loads((calibrated[1] / "report.json").read_text())
     figures = report["parts"]["Sim-to-real network"]["figures"]
     for name, key in (("calibrated", "test"), ("simulated", "test_uncorrected")):
