@@ -28,6 +28,7 @@ from benchmarks.paper.trials import (
     demonstrations_path,
     pipe_policies,
     run_path,
+    s2r_path,
     traced,
     trials,
 )
@@ -111,6 +112,11 @@ def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
         WorkStage(f"log and calibrate twin {t}", (f"{arm_name(t)}/{CALIBRATION}",), jobs.calibrate_twin, (t,))
         for t in settings.twins
     ]
+    compared = [
+        WorkStage(f"S2R as printed and ours, twin {t}", (s2r_path(t),), jobs.compare_s2r, (t,))
+        for t in settings.twins
+        if experiment == "open"
+    ]
     kept = traced(settings)
     tried = [
         WorkStage(
@@ -122,7 +128,7 @@ def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
         for trial in trials(experiment, settings)
     ]
     learning = _open_learning if experiment == "open" else _confined_learning
-    return [calibrations, *learning(settings), tried]
+    return [calibrations, compared, *learning(settings), tried]
 
 
 def _independence(name: str, settings: Settings) -> WorkStage:

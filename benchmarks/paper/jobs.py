@@ -24,6 +24,7 @@ from benchmarks.paper.trials import (
     arm_name,
     demonstrations_path,
     run_path,
+    s2r_path,
     traced,
 )
 from mjx_softarm.mechanics.pipe import PIPES
@@ -55,7 +56,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
 
     home, spec = folder / arm_name(twin), ArmSpec.default()
     home.mkdir(parents=True, exist_ok=True)
-    n_of_logs = {"log.npz": settings.n_poses} | ({MOVING: N_MOVING} if settings.arm == "rod" else {})
+    n_of_logs = _n_of_logs(settings)
     # Record random poses.
     for name, n in n_of_logs.items():
         if (home / name).exists():
@@ -71,6 +72,28 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     xla.enable_compilation_cache()
     calibration = calibrate(logs, spec)
     write_calibration(home / CALIBRATION, calibration, [*map(str, findings)], provenance("benchmarks"))
+
+
+def _n_of_logs(settings: Settings) -> dict[str, int]:
+    """Return the names of an arm's logs with their numbers of poses."""
+    return {"log.npz": settings.n_poses} | ({MOVING: N_MOVING} if settings.arm == "rod" else {})
+
+
+def compare_s2r(folder: Path, settings: Settings, twin: int) -> None:
+    """Write the errors of S2R as the paper prints it and of ours, at the same held-out poses of an arm."""
+    from calib.arm import CalibratedArm
+    from calib.read.logs import read_log
+    from calib.read.measurements import measure
+    from calib.steps import s2r_errors
+    from mjx_softarm._support import xla
+    from mjx_softarm._support.provenance import write_json
+
+    xla.enable_compilation_cache()
+    arm = CalibratedArm.read(folder / arm_name(twin) / CALIBRATION)
+    logs = [read_log(folder / arm_name(twin) / name, arm.spec)[0] for name in _n_of_logs(settings)]
+    errors = s2r_errors(measure(logs, arm.spec), arm)
+    rows = {name: dataclasses.asdict(error) for name, error in errors.items()}
+    write_json(folder / s2r_path(twin), rows)
 
 
 def train(folder: Path, settings: Settings, kind: str, twin: int | None, seed: int) -> None:

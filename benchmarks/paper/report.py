@@ -30,6 +30,7 @@ from benchmarks.paper.trials import (
     arm_name,
     filmed,
     run_path,
+    s2r_path,
     traced,
     trials,
 )
@@ -111,6 +112,11 @@ def _draw(
         first = filmed(experiment, settings)
         spec = load_policy(folder / run_path("with", first.twin, first.seed) / POLICY_FILE).spec
         logs = {trial.load_g: read_log(folder / trial.log, spec)[0] for trial in traced(settings)}
+        data["S2R at held-out poses"] = [
+            {"twin": twin, "network": name, **errors}
+            for twin in settings.twins
+            for name, errors in json.loads((folder / s2r_path(twin)).read_text("utf-8")).items()
+        ]
         data["laps"] = [{"load_g": load_g, **pictures.at_limits(log, spec)} for load_g, log in logs.items()]
         _save_picture(prefix, "circle.png", pictures.circle_figure(outcomes, settings.arm))
         _save_picture(prefix, "loads.png", pictures.loads_figure(data["runs"], settings.arm, PAPER_POINTS))

@@ -193,6 +193,11 @@ def arm_name(twin: int | None) -> str:
     return "nominal" if twin is None else f"twin{twin}"
 
 
+def s2r_path(twin: int) -> str:
+    """Return the path of the errors of an arm's sim-to-real networks in the folder."""
+    return f"{arm_name(twin)}/s2r.json"
+
+
 def demonstrations_path(twin: int, task: str) -> str:
     """Return the path of a twin's demonstrations of a task in the folder."""
     return f"twin{twin}/demos-{task}.npz"

@@ -37,8 +37,8 @@ class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""
 
     agent: cli.MaybePath = None
-    """run whose policy this one begins with: one of TQC, with its critics; for analytic any run. The widths of
-    its hidden layers are taken, too"""
+    """run whose policy this one begins with: one of TQC, with its critics; for analytic any run. The widths
+    of its hidden layers are taken, too"""
     devices: Devices = None
 
     def __call__(self) -> int:
