@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
-from train.agent.learner import ConfigError, LearnerConfig
+from train.agent.learner import LearnerConfig
 from train.agent.registry import LEARNERS, name_of
 from train.agent.tqc import TQCConfig
 
@@ -33,10 +34,10 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name, low in {"seed": 0, "evaluation_epochs": 1, "fresh_poses_epochs": 0}.items():
             if getattr(self, name) < low:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least {low}")
+                raise InputError(f"{name}: got {getattr(self, name)}, expected at least {low}")
         given_kg = self.env.randomisation.payload_max_kg
         if self.env.observation == "payload" and given_kg is not None:
-            raise ConfigError(
+            raise InputError(
                 f"env.randomisation.payload_max_kg: got {given_kg:g} with env.observation 'payload', "
                 "expected none: it is the arm's largest, since the loop may estimate so much"
             )
@@ -57,7 +58,7 @@ def override(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:
     """Return a copy of a config with settings such as `learner.gamma=0.95` changed, all of them at once.
 
     Raises:
-        ConfigError: a setting is unknown or of the wrong type, or the config refuses its value.
+        InputError: a setting is unknown or of the wrong type, or the config refuses its value.
     """
     data = to_dict(config)
     for assignment in assignments:
@@ -69,7 +70,7 @@ def override(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:
             settings = settings.get(group) if isinstance(settings, dict) else None
         if not equals or not isinstance(settings, dict) or isinstance(settings.get(name, {}), dict):
             known = ", ".join(settings if isinstance(settings, dict) else data)
-            raise ConfigError(f"{path}: got {assignment!r}, expected NAME=VALUE for one of {known}")
+            raise InputError(f"{path}: got {assignment!r}, expected NAME=VALUE for one of {known}")
         # Set the value: JSON, or a bare word.
         try:
             settings[name] = json.loads(text)
@@ -91,7 +92,7 @@ def from_dict(data: dict[str, Any]) -> TrainConfig:
     The policies of runs that have no `activation` are ReLU networks.
 
     Raises:
-        ConfigError: a setting is unknown or of the wrong type.
+        InputError: a setting is unknown or of the wrong type.
     """
     if isinstance(learner := data.get("learner"), dict):
         data = {**data, "learner": {"activation": "relu", **learner}}
@@ -104,7 +105,7 @@ def _read(kind: Any, value: Any, path: str) -> Any:
     if kind is LearnerConfig and isinstance(value, dict):
         name, value = value.get("name"), {key: item for key, item in value.items() if key != "name"}
         if name not in LEARNERS:
-            raise ConfigError(f"{path}.name: got {name!r}, expected one of {', '.join(LEARNERS)}")
+            raise InputError(f"{path}.name: got {name!r}, expected one of {', '.join(LEARNERS)}")
         kind = LEARNERS[name].config
     # A group of settings.
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
@@ -112,13 +113,13 @@ def _read(kind: Any, value: Any, path: str) -> Any:
         fields = [item.name for item in dataclasses.fields(kind)]
         if not isinstance(value, dict) or not value.keys() <= set(fields):
             got = sorted(value) if isinstance(value, dict) else value
-            raise ConfigError(f"{path}: got {got}, expected the settings {sorted(fields)}")
+            raise InputError(f"{path}: got {got}, expected the settings {sorted(fields)}")
         prefix = f"{path}." if path else ""
         values = {name: _read(hints[name], item, prefix + name) for name, item in value.items()}
         try:
             return kind(**values)
         except ValueError as error:
-            raise ConfigError(str(error)) from error
+            raise InputError(str(error)) from error
     # A single setting: one of the types of a union, or of the values of a Literal.
     if typing.get_origin(kind) is tuple and isinstance(value, list):
         return tuple(_read(typing.get_args(kind)[0], item, path) for item in value)
@@ -127,5 +128,5 @@ def _read(kind: Any, value: Any, path: str) -> Any:
         return float(value)
     if type(value) not in allowed and value not in allowed:
         names = ", ".join(getattr(item, "__name__", repr(item)) for item in allowed)
-        raise ConfigError(f"{path}: got {value!r}, expected {names}")
+        raise InputError(f"{path}: got {value!r}, expected {names}")
     return value

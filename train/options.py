@@ -13,10 +13,11 @@ from rich.console import Console
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support import cli, xla
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
 from train.agent.registry import LEARNERS, name_of
-from train.config import ConfigError, TrainConfig
+from train.config import TrainConfig
 from train.presets import PRESETS
 
 
@@ -33,7 +34,7 @@ class ArmOptions:
         if self.calibration is None:
             return CalibratedArm(ArmSpec.of(self.spec))
         if self.spec:
-            raise ConfigError(f"--spec {self.spec}: got --calibration {self.calibration} too, expected one")
+            raise InputError(f"--spec {self.spec}: got --calibration {self.calibration} too, expected one")
         arm = CalibratedArm.read(self.calibration)
         if arm.s2r is None:
             absent = self.calibration / S2R_FILE
@@ -54,15 +55,13 @@ class NewRunOptions(ArmOptions):
         """Refuse settings beside `--resume`, by comparison with the options that a command begins with.
 
         Raises:
-            ConfigError: there are some; the message names them.
+            InputError: there are some; the message names them.
         """
         names = _differing(self, new, ("resume", "devices", "config"))
         names += _differing(getattr(self, "config", None), getattr(new, "config", None))
         if names:
             given = ", ".join(f"--{name}" for name in dict.fromkeys(names))
-            raise ConfigError(
-                f"--resume {self.resume}: got {given} too, expected none: its own settings hold"
-            )
+            raise InputError(f"--resume {self.resume}: got {given} too, expected none: its own settings hold")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,14 +24,14 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from train.agent.registry import epoch_of
-from train.config import ConfigError, TrainConfig, override
+from train.config import TrainConfig, override
 from train.epoch.job import Epoch, Job, State
 from train.options import ReachOptions, start
-from train.runs.checkpoint import RunError
 from train.runs.evaluate import Summary
 from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
 from train.runs.run import Interrupted, free_path, train_together
@@ -61,7 +61,7 @@ class Sweep(ReachOptions):
             members = members_of(self.config, self.seeds, self.vary)
             path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")
             if path.exists():
-                raise RunError(f"--out: got {path}, which exists, expected a new folder, or --resume")
+                raise InputError(f"--out: got {path}, which exists, expected a new folder, or --resume")
             arm, preset = self.read_arm(console), self.preset
             runs = [Run.create(path / name, members[name], arm, preset=preset) for name in sorted(members)]
         console.print(f"sweep: {path}, {len(runs)} members", highlight=False)
@@ -103,7 +103,7 @@ def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -
         Configs by names such as `seed0-learner.gamma=0.5`.
 
     Raises:
-        ConfigError: a setting is unknown or no number, or a value cannot be used or comes twice.
+        InputError: a setting is unknown or no number, or a value cannot be used or comes twice.
     """
     # Read the values of each varied number.
     values: dict[str, list[str]] = {}
@@ -112,7 +112,7 @@ def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -
         path = path.replace("-", "_")
         if not text or path not in variable(config) or path in values:
             names = ", ".join(variable(config))
-            raise ConfigError(f"--vary: got {assignment!r}, expected NAME=VALUE,... once for each of {names}")
+            raise InputError(f"--vary: got {assignment!r}, expected NAME=VALUE,... once for each of {names}")
         values[path] = [value.strip() for value in text.split(",")]
     # Make a config of each combination.
     members = {}
@@ -121,16 +121,16 @@ def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -
         member = override(config, [f"seed={seed}", *changes])
         for path in values:
             if not isinstance(setting(member, path), float):
-                raise ConfigError(f"--vary {path}: got {setting(member, path)}, expected numbers")
+                raise InputError(f"--vary {path}: got {setting(member, path)}, expected numbers")
         members["-".join([f"seed{seed}", *changes])] = member
     return members
 
 
 def open_members(path: Path) -> list[Run]:
-    """Return the runs in the folder of a sweep, by name; raise RunError if there are none."""
+    """Return the runs in the folder of a sweep, by name; raise InputError if there are none."""
     runs = [Run.open(file.parent) for file in sorted(path.glob(f"*/{CONFIG_FILE}"))]
     if not runs:
-        raise RunError(f"{path}: got no folder of a run in it, expected the folder of a sweep")
+        raise InputError(f"{path}: got no folder of a run in it, expected the folder of a sweep")
     return runs
 
 
@@ -235,7 +235,7 @@ def report(path: Path, runs: Sequence[Run]) -> Table:
     for k, run in enumerate(runs):
         figures = run.evaluation()
         if figures is None:
-            raise RunError(f"{run.path}: got no {EVALUATION_FILE}, expected a finished run")
+            raise InputError(f"{run.path}: got no {EVALUATION_FILE}, expected a finished run")
         name = "\n".join(f"{path}={values[k]:g}" for path, values in numbers.items())
         groups.setdefault(name, []).append({"seed": run.config.seed, **figures})
     write_json(path / RESULTS_FILE, {"groups": groups, "provenance": provenance("train")})

@@ -100,7 +100,7 @@ def measure(
         keep: working folder: the same command continues, and arms may be added
 
     Raises:
-        JobError: a command failed, or the folder has other settings.
+        InputError: a command failed, or the folder has other settings.
         PeerError: SoRoMoX could not be installed.
     """
     settings, out = ArmSettings(poses, preset, steps, points, loads), keep.absolute()

@@ -84,7 +84,7 @@ def measure(
         env_steps: of each run, with stages in proportion; None: 300,000 on the circle, a million in the pipe
 
     Raises:
-        JobError: a training failed, or the folder has other settings.
+        InputError: a training failed, or the folder has other settings.
     """
     # Demonstrate, and train what is not trained yet.
     settings = PrintedSettings(env_steps)

@@ -31,10 +31,6 @@ N_WORKERS = 2  # each on its share of the cores: faster than one training on all
 DONE = (0, 1)  # exit statuses of a command that wrote its results; 1: they miss a bound
 
 
-class JobError(InputError):
-    """A stage that cannot be done; the message says which, and why."""
-
-
 class WorkStage(NamedTuple):
     """A job, called with the folder, the settings and its inputs; it is done once its results exist."""
 
@@ -53,7 +49,7 @@ def claim(folder: Path, settings: Any, more: Sequence[str] = ()) -> None:
         more: fields that may differ, since they add results to the others.
 
     Raises:
-        JobError: the folder has other settings.
+        InputError: the folder has other settings.
     """
     file, given = folder / SETTINGS_FILE, json.loads(json.dumps(dataclasses.asdict(settings)))
     shared = {name: value for name, value in given.items() if name not in more}
@@ -61,7 +57,7 @@ def claim(folder: Path, settings: Any, more: Sequence[str] = ()) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(file, shared)
     if differing := difference(json.loads(file.read_text("utf-8")), shared):
-        raise JobError(f"{file}: {differing}; choose another folder")
+        raise InputError(f"{file}: {differing}; choose another folder")
 
 
 def difference(stored: dict[str, Any], expected: dict[str, Any]) -> str:
@@ -75,7 +71,7 @@ def run_stages(folder: Path, settings: Any, groups: Sequence[Sequence[WorkStage]
     """Run the stages that are not done, group by group.
 
     Raises:
-        JobError: a stage failed, or left no results; those under way are finished, the others not begun.
+        InputError: a stage failed, or left no results; those under way are finished, the others not begun.
     """
     for group in groups:
         pending = [stage for stage in group if missing(folder, stage)]
@@ -106,10 +102,10 @@ def _in_parallel(folder: Path, settings: Any, stages: Sequence[WorkStage]) -> No
             try:
                 future.result()
                 if absent := missing(folder, stage):
-                    raise JobError(f"got no {', '.join(absent)} in {folder}, expected its results")
+                    raise InputError(f"got no {', '.join(absent)} in {folder}, expected its results")
             except Exception as error:
                 pool.shutdown(wait=True, cancel_futures=True)
-                raise JobError(f"{stage.name}: {type(error).__name__}: {error}") from error
+                raise InputError(f"{stage.name}: {type(error).__name__}: {error}") from error
             print(f"{n_done} of {len(stages)}: {stage.name}", flush=True)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -143,7 +139,7 @@ def command(log: Path, *words: Any, makes: Path, python: Path | str = sys.execut
         python: interpreter, whose environment may have other packages.
 
     Raises:
-        JobError: it failed, or wrote no such file; the message has the last lines of its output.
+        InputError: it failed, or wrote no such file; the message has the last lines of its output.
     """
     arguments = [str(python), "-m", *map(str, words)]
     with log.open("a", encoding="utf-8") as file:
@@ -151,7 +147,7 @@ def command(log: Path, *words: Any, makes: Path, python: Path | str = sys.execut
     if status not in DONE or not makes.exists():
         last = "\n".join(log.read_text("utf-8").splitlines()[-5:])
         asked = f"python -m {' '.join(arguments[2:])}: got exit status {status}"
-        raise JobError(f"{asked}, expected one of {DONE} and {makes}; {log} ends with\n{last}")
+        raise InputError(f"{asked}, expected one of {DONE} and {makes}; {log} ends with\n{last}")
 
 
 def save_arrays(path: Path, arrays: Any) -> None:
@@ -165,10 +161,10 @@ def load_arrays(kind: Any, path: Path) -> Any:
     """Read the named tuple, of the class `kind`, that `save_arrays` wrote.
 
     Raises:
-        JobError: it lacks an array.
+        InputError: it lacks an array.
     """
     with np.load(path) as file:
         if absent := [name for name in kind._fields if name not in file]:
             why = f"got no {', '.join(absent)}, expected the arrays of this version"
-            raise JobError(f"{path}: {why}; remove the file, or choose another folder")
+            raise InputError(f"{path}: {why}; remove the file, or choose another folder")
         return kind(**{name: file[name] for name in kind._fields})

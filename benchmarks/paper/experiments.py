@@ -96,7 +96,7 @@ def run(experiment: str, folder: Path, results: Path, settings: Settings) -> dic
     """Run the stages of an experiment that are not done and write its report; return the figures.
 
     Raises:
-        JobError: a stage failed, or the folder has other settings or files of an older version.
+        InputError: a stage failed, or the folder has other settings or files of an older version.
     """
     claim(folder, settings, MORE)
     run_stages(folder, settings, stages(experiment, settings))

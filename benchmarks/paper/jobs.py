@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness.stages import JobError, command, save_arrays
+from benchmarks.harness.stages import command, save_arrays
 from benchmarks.paper.trials import (
     CALIBRATION,
     EVALUATION_FILE,
@@ -27,6 +27,7 @@ from benchmarks.paper.trials import (
     s2r_path,
     traced,
 )
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.mechanics.pipe import PIPES
 from mjx_softarm.spec import ARM_FILE
 
@@ -42,7 +43,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     A rod's regulators are slow; they are fitted to a second log, of all ticks between a few poses.
 
     Raises:
-        JobError: the recording ended early.
+        InputError: the recording ended early.
     """
     from calib.read.logs import read_log
     from calib.run import calibrate, write_calibration
@@ -64,7 +65,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
         arm = _stand_in(settings)(twin, spec, session=S2R_SESSION)
         recording = record(arm, spec, random_pressures(spec, n, seed=twin), transients=name == MOVING)
         if cause := recording.ending.cause:
-            raise JobError(f"log of {n} poses: got a recording that ended early ({cause}), expected all")
+            raise InputError(f"log of {n} poses: got a recording that ended early ({cause}), expected all")
         write_log(home / name, recording.log)
     # Calibrate from the files, as a user would.
     logs, findings = zip(*(read_log(home / name, spec) for name in n_of_logs), strict=True)

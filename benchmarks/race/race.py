@@ -61,10 +61,6 @@ class RaceLimits(NamedTuple):
     stretch_s: float = 0.0  # of training between evaluations, not a limit
 
 
-class RaceError(InputError):
-    """A race that cannot be run in this folder; the message says why."""
-
-
 def race(
     seeds: cli.Integers = (0,),
     only: Annotated[tuple[str, ...], names_of(CONTESTANTS)] = CONTESTANTS,
@@ -78,12 +74,12 @@ def race(
         out: working folder; None: runs/race
 
     Raises:
-        RaceError: ours-quick failed, or the folder has results of other conditions.
+        InputError: ours-quick failed, or the folder has results of other conditions.
     """
     figures = summarise(run(out or Path("runs/race"), seeds, only))
     show({name: value for name, value in figures.items() if name != "curves"}, "race")
     if any(row["contestant"] == FIRST for row in figures["failed"]):
-        raise RaceError(f"{FIRST}: got a failure, expected a result, without which there is no race")
+        raise InputError(f"{FIRST}: got a failure, expected a result, without which there is no race")
     print(f"written: {save('race', figures)}")
     return status_of(figures)
 
@@ -95,7 +91,7 @@ def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int =
     their limits follow from it.
 
     Raises:
-        RaceError: a result in the folder was measured under other conditions.
+        InputError: a result in the folder was measured under other conditions.
     """
     folder.mkdir(parents=True, exist_ok=True)
     results = []
@@ -150,7 +146,7 @@ def _result(folder: Path, name: str, seed: int, limits: RaceLimits, n_goals: int
     if file.exists():
         result = json.loads(file.read_text("utf-8"))
         if differing := difference(result.get("conditions", {}), conditions):
-            raise RaceError(f"{file}: {differing}; choose another --out, or remove the file")
+            raise InputError(f"{file}: {differing}; choose another --out, or remove the file")
         print(f"{who}: measured before, in {file}")
         return result
     # Measure a missing one; ours runs in this environment, a peer in its own.

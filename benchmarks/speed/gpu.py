@@ -103,7 +103,7 @@ def training(preset: str, sweep: Path) -> list[dict[str, Any]]:
     """Train with some seeds at once; return a row for each, with its times to each level of `LEVELS_MM`.
 
     Raises:
-        JobError: the training failed.
+        InputError: the training failed.
     """
     seeds, options = TRAININGS[preset]
     words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]

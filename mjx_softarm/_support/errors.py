@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import enum
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 
 class InputError(ValueError):
     """An input that cannot be used; the message names the input, what was got and what was expected."""
+
+
+def check_settings(where: str, settings: Any, required: Mapping[str, tuple[Any, str]]) -> None:
+    """Raise InputError where a setting does not hold.
+
+    Args:
+        where: path or class of the settings.
+        settings: an object with the settings.
+        required: name -> whether the setting can be used, and what is expected of it.
+    """
+    for name, (holds, expected) in required.items():
+        if not holds:
+            raise InputError(f"{where}.{name}: got {getattr(settings, name)!r}, expected {expected}")
 
 
 @contextlib.contextmanager

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from tyro.conf import arg
 
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import check_settings
 from mjx_softarm.control import TOLERANCE_M
 from mjx_softarm.mdp.observation import Observation
 from mjx_softarm.mdp.rewards import RewardConfig
@@ -18,13 +18,6 @@ from mjx_softarm.spec import ArmSpec
 
 Engine = Literal["mjx", "chain", "mjx-step", "warp"]
 ENGINES = {"quasistatic": ("mjx", "chain"), "dynamic": ("mjx", "mjx-step", "warp")}  # by mode
-
-
-def _expect(config: Any, name: str, holds: bool, expected: str) -> None:
-    """Raise InputError for the field `name` of a config unless a condition holds."""
-    if not holds:
-        value = getattr(config, name)
-        raise InputError(f"{type(config).__name__}.{name}: got {value!r}, expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -43,10 +36,16 @@ class Randomisation:
     friction_max_n: float = 0.0  # in motion, each chamber's dry friction is uniform from 0 to this
 
     def __post_init__(self):
-        for name in ("payload_max_kg", "sensor_noise_mm", "delay_max_s", "friction_max_n"):
-            _expect(self, name, 0 <= (getattr(self, name) or 0.0) < math.inf, "a finite number >= 0")
-        for name in ("stiffness_spread", "damping_spread", "regulator_spread"):
-            _expect(self, name, 0 <= getattr(self, name) < 1, "0 to 1")
+        amounts = ("payload_max_kg", "sensor_noise_mm", "delay_max_s", "friction_max_n")
+        shares = ("stiffness_spread", "damping_spread", "regulator_spread")
+        required = {
+            **{
+                name: (0 <= (getattr(self, name) or 0.0) < math.inf, "a finite number >= 0")
+                for name in amounts
+            },
+            **{name: (0 <= getattr(self, name) < 1, "0 to 1") for name in shares},
+        }
+        check_settings("Randomisation", self, required)
 
 
 @dataclass(frozen=True)
@@ -102,51 +101,60 @@ class EnvConfig:
             InputError: a corrected arm is to have other links, or an action is shorter than a control period.
         """
         period_s = 1.0 / spec.control.rate_hz
-        _expect(
-            self, "dynamic_step_s", self.dynamic_step_s >= period_s, f"{period_s:g} or more, a control period"
-        )
-        own, n = spec.structure.links_per_section, self.links_per_section
-        if n is None or n == own:
-            return spec
-        _expect(self, "links_per_section", not corrected, f"{own}, as the sim-to-real network has")
-        return spec.replace(structure={"links_per_section": n})
+        own = spec.structure.links_per_section
+        same = self.links_per_section in (None, own)
+        required = {
+            "dynamic_step_s": (self.dynamic_step_s >= period_s, f"{period_s:g} or more, a control period"),
+            "links_per_section": (same or not corrected, f"{own}, as the sim-to-real network has"),
+        }
+        check_settings("EnvConfig", self, required)
+        return spec if same else spec.replace(structure={"links_per_section": self.links_per_section})
 
     def __post_init__(self):
-        # Names
-        for name, allowed in (
-            ("mode", tuple(ENGINES)),
-            ("engine", get_args(Engine)),
-            ("observation", get_args(Observation)),
-        ):
-            _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
-        allowed = ENGINES[self.mode]
-        _expect(self, "engine", self.engine in allowed, f"one of {allowed} with the mode {self.mode!r}")
-        known = self.moves or self.observation != "motion"
-        _expect(self, "observation", known, "'pose' or 'payload' for arms at rest")
+        # Names, and which of them go together
+        names = {"mode": tuple(ENGINES), "engine": get_args(Engine), "observation": get_args(Observation)}
+        known = {
+            name: (getattr(self, name) in allowed, f"one of {allowed}") for name, allowed in names.items()
+        }
+        check_settings("EnvConfig", self, known)
+        engines = ENGINES[self.mode]
+        observed = self.moves or self.observation != "motion"
+        required = {
+            "engine": (self.engine in engines, f"one of {engines} with the mode {self.mode!r}"),
+            "observation": (observed, "'pose' or 'payload' for arms at rest"),
+        }
+        check_settings("EnvConfig", self, required)
 
         # Ranges of numbers
-        for name in ("dynamic_step_s", "simulation_step_s"):
-            _expect(self, name, 0 < getattr(self, name) < math.inf, "a finite number > 0")
-        amounts = [(self.reward, item.name) for item in fields(self.reward) if item.name != "axes"]
-        amounts += [(self, "clearance_cost_per_mm"), (self, "saturation_tolerance_mm")]
-        for config, name in amounts:
-            _expect(config, name, 0 <= getattr(config, name) < math.inf, "a finite number >= 0")
+        links = self.links_per_section
+        other = f"another: {HELD_OUT_SEED} draws the goals of the evaluation"
+        amount = "a finite number >= 0"
+        required = {
+            "dynamic_step_s": (0 < self.dynamic_step_s < math.inf, "a finite number > 0"),
+            "simulation_step_s": (0 < self.simulation_step_s < math.inf, "a finite number > 0"),
+            "saturation_tolerance_mm": (0 <= self.saturation_tolerance_mm < math.inf, amount),
+            "clearance_margin_mm": (math.isfinite(self.clearance_margin_mm), "a finite number"),
+            "n_poses": (self.n_poses >= 1, "at least 1"),
+            "links_per_section": (links is None or links >= 1, "at least 1"),
+            "even_share": (0 <= self.even_share <= 1, "0 to 1"),
+            "workspace_seed": (self.workspace_seed != HELD_OUT_SEED, other),
+            "clearance_cost_per_mm": (0 <= self.clearance_cost_per_mm < math.inf, amount),
+        }
+        check_settings("EnvConfig", self, required)
+        costs = {item.name for item in fields(self.reward)} - {"axes"}
         axes = self.reward.axes
         weighed = len(axes) == 6 and all(0 <= axis < math.inf for axis in axes) and any(self.reward.asked)
-        _expect(self.reward, "axes", weighed, "six finite numbers >= 0, some more than 0")
-        _expect(self, "clearance_margin_mm", math.isfinite(self.clearance_margin_mm), "a finite number")
-        _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
-        links = self.links_per_section
-        _expect(self, "links_per_section", links is None or links >= 1, "at least 1")
-        _expect(self, "even_share", 0 <= self.even_share <= 1, "0 to 1")
-        other = f"another: {HELD_OUT_SEED} draws the goals of the evaluation"
-        _expect(self, "workspace_seed", self.workspace_seed != HELD_OUT_SEED, other)
+        required = {name: (0 <= getattr(self.reward, name) < math.inf, amount) for name in sorted(costs)}
+        required["axes"] = weighed, "six finite numbers >= 0, some more than 0"
+        check_settings("RewardConfig", self.reward, required)
 
+        # Settings of MJX-Warp and of the pipe
+        piped = self.pipe_diameter_mm is not None
         no_friction = self.engine != "warp" or not self.randomisation.friction_max_n
-        _expect(self.randomisation, "friction_max_n", no_friction, "0 with the engine 'warp'")
-
-        # Pipe
-        free = self.pipe_diameter_mm is not None or not self.clearance_cost_per_mm
-        _expect(self, "clearance_cost_per_mm", free, "0.0 without a pipe_diameter_mm")
+        required = {"friction_max_n": (no_friction, "0 with the engine 'warp'")}
+        check_settings("Randomisation", self.randomisation, required)
+        no_cost = piped or not self.clearance_cost_per_mm
+        required = {"clearance_cost_per_mm": (no_cost, "0.0 without a pipe_diameter_mm")}
+        check_settings("EnvConfig", self, required)
         if self.pipe_diameter_mm is not None:
             CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError

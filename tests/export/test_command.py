@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.export.golden import read_golden
 from tests.export.conftest import few_golden_rows
 from train.runs import arm_model
 from train.runs import export as command
-from train.runs.checkpoint import RunError
 
 
 def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
@@ -41,5 +41,5 @@ def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
 
 
 def test_one_folder_holds_one_policy(tmp_path):
-    with pytest.raises(RunError, match="RUN: got 2, expected one folder of a run"):
+    with pytest.raises(InputError, match="RUN: got 2, expected one folder of a run"):
         command.export((tmp_path, tmp_path), cpp=tmp_path / "cpp")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
@@ -21,7 +22,6 @@ from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from tests.train.small import CONFIG, SHORT, distil_little, flags, new_job
 from train.__main__ import main
-from train.runs.checkpoint import RunError
 from train.runs.folder import Run, sole_trainer
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -180,7 +180,7 @@ def test_help_explains_every_setting(command, capsys):
 
 def test_a_folder_has_one_trainer_at_a_time(tmp_path):
     """One that was killed holds it no longer: such a run is resumed above."""
-    with sole_trainer(tmp_path), pytest.raises(RunError, match=f"{tmp_path}: got another process"):
+    with sole_trainer(tmp_path), pytest.raises(InputError, match=f"{tmp_path}: got another process"):
         sole_trainer(tmp_path).__enter__()
     with sole_trainer(tmp_path):
         pass

@@ -5,10 +5,11 @@ import json
 
 import pytest
 
+from mjx_softarm._support.errors import InputError
 from train.agent.analytic import AnalyticConfig
 from train.agent.registry import LEARNERS, check_configs
 from train.agent.tqc import TQCConfig
-from train.config import ConfigError, TrainConfig, from_dict, override, to_dict
+from train.config import TrainConfig, from_dict, override, to_dict
 from train.presets import IMITATION_PRESETS, PRESETS
 
 
@@ -39,26 +40,26 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
     ],
 )
 def test_a_setting_that_cannot_be_is_named(assignment, message):
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(InputError) as error:
         override(PRESETS["quick"], [assignment])
     assert message in str(error.value)
 
 
 def test_a_payload_that_is_observed_is_up_to_the_arm_s_largest():
     for given in (0.0, 0.5):
-        with pytest.raises(ConfigError, match=f"payload_max_kg: got {given:g} .*, expected none"):
+        with pytest.raises(InputError, match=f"payload_max_kg: got {given:g} .*, expected none"):
             override(PRESETS["payload"], [f"env.randomisation.payload_max_kg={given}"])
 
 
 @pytest.mark.parametrize(
     "setting, message",
     [
-        ("env.observation=payload", "env.observation: got payload, expected 'pose'"),
-        ("env.mode=dynamic", "env.mode: got dynamic, expected 'quasistatic'"),
+        ("env.observation=payload", "env.observation: got 'payload', expected 'pose'"),
+        ("env.mode=dynamic", "env.mode: got 'dynamic', expected 'quasistatic'"),
     ],
 )
 def test_demonstrations_are_of_arms_at_rest_and_know_no_payload(setting, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(InputError, match=message):
         override(IMITATION_PRESETS["pipe"], [setting])
 
 
@@ -74,9 +75,9 @@ def test_presets_survive_json(config):
 
 def test_json_with_a_setting_too_many_is_refused_and_a_missing_one_has_its_default():
     data = to_dict(TrainConfig())
-    with pytest.raises(ConfigError, match="config.learner: got .* expected the settings"):
+    with pytest.raises(InputError, match="config.learner: got .* expected the settings"):
         from_dict({**data, "learner": {**data["learner"], "extra": 1}})
-    with pytest.raises(ConfigError, match="config.learner.name: got 'ppo', expected one of tqc, analytic"):
+    with pytest.raises(InputError, match="config.learner.name: got 'ppo', expected one of tqc, analytic"):
         from_dict({**data, "learner": {"name": "ppo"}})
     assert from_dict({"learner": {"name": "tqc"}}) == TrainConfig()
 
@@ -122,7 +123,7 @@ def test_each_stages_end_is_evaluated(imitation_config):
     ],
 )
 def test_a_bad_setting_of_imitation_is_named(imitation_config, assignment, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(InputError, match=message):
         override(imitation_config, [assignment])
 
 

@@ -11,17 +11,18 @@ import pytest
 from rich.console import Console
 
 from calib.arm import CalibratedArm
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
 from tests.train import small
 from tests.train.small import SHORT, new_job
 from train import sweep
 from train.__main__ import main
-from train.config import ConfigError, override
+from train.config import override
 from train.epoch.job import Job
 from train.presets import PRESETS
 from train.runs import plots
-from train.runs.checkpoint import Checkpoints, RunError
+from train.runs.checkpoint import Checkpoints
 from train.runs.evaluate import Summary
 from train.runs.folder import Run
 from train.runs.task import Task
@@ -222,7 +223,7 @@ def test_the_table_has_mean_least_and_greatest_over_the_seeds(tmp_path):
     """Two seeds and two settings with figures made up; a member without figures is named."""
     create(tmp_path, members_of(CONFIG, (0, 1), ["learner.gamma=0.5,0.9"]))
     runs = open_members(tmp_path)
-    with pytest.raises(RunError, match="got no evaluation.json, expected a finished run"):
+    with pytest.raises(InputError, match="got no evaluation.json, expected a finished run"):
         report(tmp_path, runs)
     medians = {(0, 0.5): 2.0, (1, 0.5): 5.0, (0, 0.9): 6.0, (1, 0.9): 8.0}
     for run in runs:
@@ -248,12 +249,12 @@ def test_the_table_has_mean_least_and_greatest_over_the_seeds(tmp_path):
     ],
 )
 def test_what_cannot_be_varied_is_refused_by_name(vary, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(InputError, match=message):
         members_of(PRESETS["quick"], (0,), vary)
 
 
 def test_a_folder_that_is_no_sweep_is_named_and_resume_goes_alone(tmp_path, capsys):
-    with pytest.raises(RunError, match="got no folder of a run in it, expected the folder of a sweep"):
+    with pytest.raises(InputError, match="got no folder of a run in it, expected the folder of a sweep"):
         open_members(tmp_path)
     assert main(["sweep", "--resume", "x", "--seeds", "1"]) == 2
     assert "--resume x: got --seeds too, expected none" in capsys.readouterr().err

@@ -33,12 +33,13 @@ from jax.sharding import Mesh
 
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
+from mjx_softarm._support.errors import check_settings
 from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv, choose_arms, over_arms
 from mjx_softarm.mdp import rewards
-from train.agent.learner import LearnerConfig, check_settings
+from train.agent.learner import LearnerConfig
 from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
 from train.epoch.devices import check_split, everywhere, split
 
@@ -50,7 +51,7 @@ EARLY = 0.2  # weight of the mean cost of all actions beside that of the last: t
 
 @dataclass(frozen=True)
 class AnalyticConfig(LearnerConfig):
-    """Hyperparameters of learning through the simulation. Raises ConfigError naming a bad field."""
+    """Hyperparameters of learning through the simulation. Raises InputError naming a bad field."""
 
     VARIABLE = ("learning_rate", "learning_rate_half", "mean_share", "saturation_cost_per_mm")
 
@@ -77,7 +78,7 @@ class AnalyticConfig(LearnerConfig):
         check_settings("learner", self, required)
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ConfigError for an engine whose gradient this learner does not take."""
+        """Raise InputError for an engine whose gradient this learner does not take."""
         engine = "mjx" if env.moves else "chain"
         usable = env.engine == engine
         check_settings("env", env, {"engine": (usable, f"{engine!r}, whose gradient this learner takes")})
@@ -178,7 +179,7 @@ class GradientEpoch:
     Args:
         config: hyperparameters.
         env: the arm.
-        mesh: devices over which the arms are spread, if there are several. Raises ConfigError where these
+        mesh: devices over which the arms are spread, if there are several. Raises InputError where these
             cannot be split evenly.
     """
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from train.agent.learner import check_settings
+from mjx_softarm._support.errors import check_settings
 from train.agent.networks import descend
 
 Score = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...)

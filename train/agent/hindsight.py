@@ -19,9 +19,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm._support import draws
+from mjx_softarm._support.errors import check_settings
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Experience, Transition, check_settings
+from train.agent.learner import Experience, Transition
 
 NEAR_MM = (1.0, 100.0)  # distances of near goals; a millimetre goes with a turn of a degree
 

@@ -28,12 +28,13 @@ from jax import Array
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import xla
+from mjx_softarm._support.errors import check_settings
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import choose_arms
 from mjx_softarm.mdp import rewards
 from train.agent.gail import DiscriminatorState, Gail, GailConfig
-from train.agent.learner import Transition, check_settings
+from train.agent.learner import Transition
 from train.agent.networks import check_same_shapes
 from train.agent.tqc import TQC, TQCConfig, TQCState
 from train.demos.demonstrations import Demonstrations, shown_before
@@ -82,7 +83,7 @@ STAGES_OPTION = PrimitiveConstructorSpec(
 
 @dataclass(frozen=True)
 class ImitationConfig(TQCConfig):
-    """Settings of learning from demonstrations, whose poses are the goals. Raises ConfigError."""
+    """Settings of learning from demonstrations, whose poses are the goals. Raises InputError."""
 
     gail: GailConfig = field(default_factory=GailConfig)
     """discriminator"""
@@ -123,7 +124,7 @@ class ImitationConfig(TQCConfig):
         check_settings("learner", self, required)
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ConfigError for an environment that does not suit demonstrations.
+        """Raise InputError for an environment that does not suit demonstrations.
 
         A demonstrated action leads to one pose from every start, at rest and with one payload alone.
         """

@@ -1,41 +1,23 @@
-"""Settings that every learner has, transitions as they are stored and learned from, and checks of settings.
+"""Settings that every learner has, and transitions as they are stored and learned from.
 
 Shapes: B batch, O observation, A action.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 from jax import Array
 
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import check_settings
 from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig
 
 
-class ConfigError(InputError):
-    """A setting that cannot be used; the message names it, what it got and what was expected."""
-
-
-def check_settings(where: str, settings: Any, required: Mapping[str, tuple[bool, str]]) -> None:
-    """Raise ConfigError where a setting does not hold.
-
-    Args:
-        where: path of the settings in a run's config.
-        settings: an object with the settings.
-        required: name -> whether the setting can be used, and what is expected of it.
-    """
-    for name, (holds, expected) in required.items():
-        if not holds:
-            raise ConfigError(f"{where}.{name}: got {getattr(settings, name)}, expected {expected}")
-
-
 @dataclass(frozen=True)
 class LearnerConfig:
-    """Settings of every learner; the config of a learner inherits from it. Raises ConfigError."""
+    """Settings of every learner; the config of a learner inherits from it. Raises InputError."""
 
     VARIABLE: ClassVar[tuple[str, ...]] = ()  # names of plain numbers that members of a sweep may differ in
 
@@ -50,7 +32,7 @@ class LearnerConfig:
         check_settings("learner", self, {name: (getattr(self, name) >= 1, "at least 1") for name in counts})
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ConfigError where the learner cannot learn in an environment."""
+        """Raise InputError where the learner cannot learn in an environment."""
 
     @property
     def n_epochs(self) -> int:

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 from jax.sharding import Mesh
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import ReachEnv
 from train.agent.analytic import AnalyticConfig, GradientEpoch
 from train.agent.imitation import DemonstratedGoals, Imitation, ImitationConfig
-from train.agent.learner import ConfigError, LearnerConfig
+from train.agent.learner import LearnerConfig
 from train.agent.tqc import TQC, TQCConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.job import Epoch
@@ -47,7 +48,7 @@ def _gradient(config: Any, env: ReachEnv, mesh: Mesh | None, _: Demonstrations |
 
 def _imitation(config: Any, env: ReachEnv, mesh: Mesh | None, shown: Demonstrations | None) -> Epoch:
     if shown is None:
-        raise ConfigError("learner: got 'imitation' without demonstrations, expected a file of them")
+        raise InputError("learner: got 'imitation' without demonstrations, expected a file of them")
     return ReplayEpoch(
         config, env, Imitation(config, env, shown), DemonstratedGoals(config, env, shown), mesh
     )
@@ -95,6 +96,6 @@ def epoch_of(
         shown: demonstrations, for a learner from these.
 
     Raises:
-        ConfigError: demonstrations are missing, or something cannot be split evenly over the devices.
+        InputError: demonstrations are missing, or something cannot be split evenly over the devices.
     """
     return LEARNERS[name_of(config)].epoch(config, env, mesh, shown)

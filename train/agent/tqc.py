@@ -32,11 +32,12 @@ import optax
 from jax import Array
 
 from mjx_softarm._support import draws
+from mjx_softarm._support.errors import check_settings
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
 from train.agent import networks
 from train.agent.hindsight import HindsightConfig
-from train.agent.learner import Transition, check_settings
+from train.agent.learner import Transition
 from train.epoch.replay_epoch import ReplayConfig
 
 Params = Any  # a flax parameter tree
@@ -47,7 +48,7 @@ COST_AHEAD = 40.0  # initial weight of a predicted error of 1, summed over the p
 
 @dataclass(frozen=True)
 class TQCConfig(ReplayConfig):
-    """Hyperparameters, by default stable-baselines3-contrib's. Raises ConfigError naming a bad field."""
+    """Hyperparameters, by default stable-baselines3-contrib's. Raises InputError naming a bad field."""
 
     VARIABLE = ("learning_rate", "learning_rate_alpha", "gamma", "tau", "initial_alpha", "target_entropy")
     VARIABLE += ("reward_scale", *(f"hindsight.{name}" for name in HindsightConfig.VARIABLE))
@@ -83,7 +84,7 @@ class TQCConfig(ReplayConfig):
         check_settings("learner", self, required)
 
     def check(self, env: EnvConfig) -> None:
-        """Raise ConfigError where the learner cannot learn in an environment."""
+        """Raise InputError where the learner cannot learn in an environment."""
         super().check(env)
         seen = self.n_ahead == 0 or env.observation == "motion"
         check_settings("learner", self, {"n_ahead": (seen, "0 without env.observation 'motion'")})

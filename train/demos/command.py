@@ -12,13 +12,13 @@ import tyro
 from rich.console import Console
 
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers import names
 from mjx_softarm.deploy.drivers.names import check_number
 from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, save_log
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import TABLES, Log
 from mjx_softarm.spec import ArmSpec
-from train.config import ConfigError
 from train.demos.demonstrations import from_log, read_demonstrations
 from train.demos.expert import Expert
 from train.demos.record import WaypointRecorder
@@ -41,7 +41,7 @@ class Record(ArmOptions):
         console = start()
         check_file("--out", self.out, TABLES)
         if self.out.exists():
-            raise ConfigError(f"--out: got {self.out}, which is there already, expected a new file")
+            raise InputError(f"--out: got {self.out}, which is there already, expected a new file")
         # Plan all postures before the arm moves.
         spec, s2r, _ = self.read_arm(console)
         arm = names.open_arm(self.arm)

@@ -19,7 +19,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from train.agent.learner import ConfigError
+from mjx_softarm._support.errors import InputError
 
 AXIS = "devices"
 CLUSTER = "cluster"
@@ -40,7 +40,7 @@ def mesh_of(devices: str | None) -> Mesh | None:
         Mesh with one axis of devices; None is one device.
 
     Raises:
-        ConfigError: there are fewer devices, or the processes do not meet.
+        InputError: there are fewer devices, or the processes do not meet.
     """
     if devices is None or devices == "1":
         return None
@@ -51,12 +51,12 @@ def mesh_of(devices: str | None) -> Mesh | None:
         if len(local) < n:
             on_cpu = jax.default_backend() == "cpu"
             hint = "; the environment variable JAX_NUM_CPU_DEVICES makes more of a CPU" * on_cpu
-            raise ConfigError(f"--devices: got {n}, expected at most {len(local)}, which there are{hint}")
+            raise InputError(f"--devices: got {n}, expected at most {len(local)}, which there are{hint}")
         return Mesh(np.array(local[:n]), (AXIS,))
     # Devices of several processes, which meet at an address or by the cluster's own means.
     meeting = _MEETING.fullmatch(devices)
     if not meeting and devices != CLUSTER:
-        raise ConfigError(f"--devices: got {devices!r}, expected a number, {CLUSTER} or HOST:PORT/K/N")
+        raise InputError(f"--devices: got {devices!r}, expected a number, {CLUSTER} or HOST:PORT/K/N")
     try:
         if meeting:
             address, process, n_processes = meeting.groups()
@@ -64,15 +64,15 @@ def mesh_of(devices: str | None) -> Mesh | None:
         else:
             jax.distributed.initialize()
     except (ValueError, RuntimeError) as error:
-        raise ConfigError(f"--devices: got {devices} ({error}), expected processes that meet") from error
+        raise InputError(f"--devices: got {devices} ({error}), expected processes that meet") from error
     return Mesh(np.array(jax.devices()), (AXIS,))
 
 
 def check_split(config: Any, names: Sequence[str], mesh: Mesh) -> None:
-    """Raise ConfigError where one of some numbers of a learner cannot be split evenly over the devices."""
+    """Raise InputError where one of some numbers of a learner cannot be split evenly over the devices."""
     for name in names:
         if getattr(config, name) % mesh.size:
-            raise ConfigError(
+            raise InputError(
                 f"learner.{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
             )
 

@@ -18,12 +18,13 @@ from jax.sharding import Mesh
 
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
+from mjx_softarm._support.errors import check_settings
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.mdp.actions import N_ACTIONS
 from train.agent.hindsight import HindsightConfig, later_pose, relabel
-from train.agent.learner import Experience, LearnerConfig, Transition, check_settings
+from train.agent.learner import Experience, LearnerConfig, Transition
 from train.epoch import replay
 from train.epoch.devices import check_split, everywhere, split, spread
 
@@ -32,7 +33,7 @@ COUNTS = ("env/unsettled", "env/episodes", "env/successes")  # metrics summed ov
 
 @dataclass(frozen=True)
 class ReplayConfig(LearnerConfig):
-    """Settings of a learner from the replay. Raises ConfigError."""
+    """Settings of a learner from the replay. Raises InputError."""
 
     episode_length: int = N_ACTIONS  # actions per episode at most
     updates_per_env_step: float = 1.0  # gradient steps per action of one arm
@@ -149,7 +150,7 @@ class ReplayEpoch:
         env: the arm.
         learner: learner.
         goals: distribution of starts and goals; None: as the environment draws them.
-        mesh: devices, if there are several. Raises ConfigError for what cannot be split evenly.
+        mesh: devices, if there are several. Raises InputError for what cannot be split evenly.
     """
 
     def __init__(

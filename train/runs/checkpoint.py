@@ -22,10 +22,6 @@ N_KEPT = 2
 _DAMAGE = ("DATA_LOSS", "OUT_OF_RANGE", "NOT_FOUND", "FAILED_PRECONDITION")
 
 
-class RunError(InputError):
-    """A folder without a usable run; the message names the folder and the fault."""
-
-
 class Checkpoints:
     """The newest checkpoints of a run, in the subfolder `checkpoints` of its folder."""
 
@@ -72,7 +68,7 @@ class Checkpoints:
             like: a state, or its shapes, structured as the run's.
 
         Raises:
-            RunError: there is no checkpoint, or it has another structure.
+            InputError: there is no checkpoint, or it has another structure.
         """
         shapes = ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like))
         return self._newest("state", shapes)
@@ -81,7 +77,7 @@ class Checkpoints:
         """Return the newest checkpoint's parts of the learner as NumPy arrays; see `Learner.parts`.
 
         Raises:
-            RunError: there is no checkpoint, or it is another version's.
+            InputError: there is no checkpoint, or it is another version's.
         """
         return self._newest("parts", ocp.args.StandardRestore())[1]
 
@@ -89,7 +85,7 @@ class Checkpoints:
         """Return the number of epochs behind the newest checkpoint, and an item of it."""
         epoch = self.latest
         if epoch is None:
-            raise RunError(f"{self.run}: got no checkpoint, expected one; start the run anew")
+            raise InputError(f"{self.run}: got no checkpoint, expected one; start the run anew")
         try:
             return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
         except Exception as error:
@@ -97,13 +93,13 @@ class Checkpoints:
             if _is_damage(folder / item, error):
                 earlier = [saved for saved in self.epochs if saved < epoch]
                 remedy = f"; without {folder} the run goes back to epoch {earlier[-1]}" if earlier else ""
-                raise RunError(
+                raise InputError(
                     f"{folder / item}: got a damaged checkpoint ({str(error).splitlines()[0][:200]}), "
                     f"expected it as it was written{remedy}"
                 ) from error
             if not isinstance(error, (ValueError, KeyError)):
                 raise
-            raise RunError(
+            raise InputError(
                 f"{self.run}: got a checkpoint of other parts or sizes, expected this version's; "
                 "continue it with the commit that its config.json names"
             ) from error

@@ -15,11 +15,12 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.config import ENGINES
 from train.agent.imitation import ImitationConfig
-from train.config import ConfigError, TrainConfig
+from train.config import TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
 from train.epoch import devices
 from train.options import NewRunOptions, ReachOptions, named, start
@@ -81,15 +82,15 @@ class Imitate(NewRunOptions):
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
         if self.file is None:
-            raise ConfigError("FILE: got nothing, expected the demonstrations, or --resume RUN")
+            raise InputError("FILE: got nothing, expected the demonstrations, or --resume RUN")
         # Settings of the learned reward, which may be another run's.
         learner = cast(ImitationConfig, self.config.learner)
         learner = dataclasses.replace(learner, frozen=learner.frozen or self.reward is not None)
         if learner.frozen and not self.reward:
             expected = "--reward RUN, the run whose learned reward it takes"
-            raise ConfigError(f"learner.frozen: got true, expected {expected}")
+            raise InputError(f"learner.frozen: got true, expected {expected}")
         if self.reward and not learner.learned_weight:
-            raise ConfigError(
+            raise InputError(
                 f"learner.learned_weight: got 0 with --reward {self.reward}, expected more, for its reward"
             )
         config = dataclasses.replace(self.config, learner=learner)
@@ -113,20 +114,20 @@ def evaluate(
         actions: number of actions towards each goal, in motion; None: 4
 
     Raises:
-        ConfigError: the payload or the number of actions is out of range.
+        InputError: the payload or the number of actions is out of range.
     """
     # Check the options.
     if not 0.0 <= payload < math.inf:
-        raise ConfigError(f"--payload: got {payload:g}, expected a finite number >= 0")
+        raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if actions is not None and (actions < 1 or in_motion is None):
         where = " without --in-motion" if in_motion is None else ""
-        raise ConfigError(f"--actions: got {actions}{where}, expected a positive number with --in-motion")
+        raise InputError(f"--actions: got {actions}{where}, expected a positive number with --in-motion")
     # Evaluate under the run's own conditions, with pictures, unless others are asked for.
     n_actions = actions or N_ACTIONS
     console = start()
     opened = Run.open(run)
     if in_motion is not None and opened.demonstrations():
-        raise ConfigError("--in-motion: got a run of `imitate`, expected one of `reach`")
+        raise InputError("--in-motion: got a run of `imitate`, expected one of `reach`")
     task, policy = runs.task_of_run(opened), opened.policy()
     if in_motion is None and not payload:
         _show(opened, task, runs.finish(opened, task, policy), console)

@@ -33,6 +33,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.archive import Entries, layer_entries, write_sealed
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import (
     Observation,
@@ -52,7 +53,6 @@ from mjx_softarm.policy.file import (
     save_policy,
 )
 from mjx_softarm.spec import ArmSpec
-from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 
 if TYPE_CHECKING:
@@ -86,10 +86,10 @@ def export(
     alone = out or cpp or weights
     if not folders or (alone and len(folders) > 1):
         expected = "one folder of a run" + ("" if alone else " or more")
-        raise RunError(f"RUN: got {len(folders)}, expected {expected}")
+        raise InputError(f"RUN: got {len(folders)}, expected {expected}")
     others = {"--out": out, "--onnx": onnx, "--cpp": cpp, "--calibration": calibration}
     if weights and (given := [name for name, value in others.items() if value]):
-        raise RunError(f"--weights: got {' and '.join(given)} too, expected it alone")
+        raise InputError(f"--weights: got {' and '.join(given)} too, expected it alone")
     console = Console(highlight=False, markup=False, soft_wrap=True)
     if not weights:
         n_enough = sum(_export(path, out, onnx, cpp, calibration, console) for path in folders)
@@ -149,7 +149,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
         path: file to write; `policy.npz` in the run by default.
 
     Raises:
-        RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
+        InputError: the run has no checkpoint, or its learner's policy is no network of the file's form.
         SealedFileError: the file cannot be written.
     """
     # Say how the policy came about: the run's config with versions and commit, and the arm's networks.
@@ -175,7 +175,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
             action_s=env.dynamic_step_s if env.moves else 0.0,
         )
     except (ValueError, AttributeError) as error:
-        raise RunError(f"{run.path}: {error}") from error
+        raise InputError(f"{run.path}: {error}") from error
     path = path or run.path / "policy.npz"
     save_policy(path, policy)
     return path
@@ -185,19 +185,19 @@ def actor_of(run: Run) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Return weight and bias of each layer of a run's newest actor.
 
     Raises:
-        RunError: the run has no checkpoint, or its policy is not a network that an export can hold.
+        InputError: the run has no checkpoint, or its policy is not a network that an export can hold.
     """
     try:
         return actor_layers(run.policy(), run.spec)
     except (ValueError, AttributeError) as error:
-        raise RunError(f"{run.path}: {error}") from error
+        raise InputError(f"{run.path}: {error}") from error
 
 
 def actor_entries(run: Run) -> dict[str, np.ndarray]:
     """Return the entries of the file with a run's actor alone; the module lists them.
 
     Raises:
-        RunError: see `actor_of`.
+        InputError: see `actor_of`.
         SealedFileError: a layer has another size than observation or action, or is not finite.
     """
     spec, env = run.spec, run.config.env

@@ -13,6 +13,7 @@ from typing import Any
 from jax.experimental.multihost_utils import sync_global_devices
 
 from calib.arm import CalibratedArm
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.files import read_json_lines, replacing
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.logs.files import LogError
@@ -24,7 +25,7 @@ from train.agent.registry import learns_from_demonstrations
 from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
 from train.epoch.devices import is_first_process
-from train.runs.checkpoint import Checkpoints, RunError
+from train.runs.checkpoint import Checkpoints
 
 CONFIG_FILE, EVALUATION_FILE, METRICS_FILE = "config.json", "evaluation.json", "metrics.jsonl"
 DEMONSTRATIONS_FILE, LOCK_FILE = "demonstrations.npz", "training.lock"
@@ -75,11 +76,11 @@ class Run:
             preset: name of the settings that these began with, if they have one.
 
         Raises:
-            RunError: the folder already holds a run, or cannot be made.
+            InputError: the folder already holds a run, or cannot be made.
         """
         # Refuse a folder with a run. All processes look before the first one writes.
         if (path / CONFIG_FILE).exists():
-            raise RunError(
+            raise InputError(
                 f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"
             )
         sync_global_devices(f"{path} is free")
@@ -107,7 +108,7 @@ class Run:
             if is_first_process():
                 write_json(path / CONFIG_FILE, data)
         except OSError as error:
-            raise RunError(f"{path}: got {error.strerror!r}, expected to write a new folder") from error
+            raise InputError(f"{path}: got {error.strerror!r}, expected to write a new folder") from error
         return run
 
     @classmethod
@@ -115,7 +116,7 @@ class Run:
         """Open an existing folder.
 
         Raises:
-            RunError: there is no run in it, or its config cannot be read.
+            InputError: there is no run in it, or its config cannot be read.
             SealedFileError: a model of its calibration cannot be read.
         """
         file = path / CONFIG_FILE
@@ -124,15 +125,15 @@ class Run:
             config, has_s2r = from_dict(data["train"]), data["s2r"]
             spec = ArmSpec.from_dict(data["spec"], str(file))
         except OSError as error:
-            raise RunError(f"{file}: got {error.strerror!r}, expected the folder of a run") from error
+            raise InputError(f"{file}: got {error.strerror!r}, expected the folder of a run") from error
         except (ValueError, KeyError, TypeError) as error:
-            raise RunError(
+            raise InputError(
                 f"{file}: got a damaged config or another version's ({error}), expected this version's; "
                 "train it anew, or use the version that the file names"
             ) from error
         arm = CalibratedArm.with_models(spec, path)
         if has_s2r and arm.s2r is None:
-            raise RunError(f"{path / S2R_FILE}: got no file, expected the network that the run trains with")
+            raise InputError(f"{path / S2R_FILE}: got no file, expected the network that the run trains with")
         return cls(path, config, arm)
 
     def origin(self) -> dict[str, Any]:
@@ -143,14 +144,14 @@ class Run:
         """Return the demonstrations that the run learns from, or None.
 
         Raises:
-            RunError: its file cannot be read.
+            InputError: its file cannot be read.
         """
         if not learns_from_demonstrations(self.config.learner):
             return None
         try:
             return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
         except LogError as error:
-            raise RunError(str(error)) from error
+            raise InputError(str(error)) from error
 
     def policy(self) -> Any:
         """Return the parameters of the newest checkpoint's policy; see `Checkpoints.parts`."""
@@ -160,12 +161,12 @@ class Run:
         """Check that a run without a checkpoint was stopped before its first one.
 
         Raises:
-            RunError: it had a checkpoint: it began with another run's, or its metrics go further.
+            InputError: it had a checkpoint: it began with another run's, or its metrics go further.
         """
         done = max((row["epoch"] for row in self.metrics()), default=0)
         # A process may have died after the metrics of an epoch and before its checkpoint.
         if self.origin()["begins_with"] or any(map(self.config.evaluates_after, range(1, done))):
-            raise RunError(
+            raise InputError(
                 f"{self.checkpoints.path}: got no checkpoint of a run with {done} epochs in {METRICS_FILE}, "
                 "expected one; bring the folder back, or train anew with another --out"
             )
@@ -212,7 +213,7 @@ def sole_trainer(path: Path) -> Iterator[None]:
     Where several processes train together, the first one holds it.
 
     Raises:
-        RunError: another process holds it.
+        InputError: another process holds it.
     """
     with contextlib.ExitStack() as stack:
         if is_first_process():
@@ -220,7 +221,7 @@ def sole_trainer(path: Path) -> Iterator[None]:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise RunError(
+                raise InputError(
                     f"{path}: got another process that trains in it, expected none; stop it, or wait"
                 ) from error
         yield

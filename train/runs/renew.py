@@ -9,10 +9,10 @@ from rich.console import Console
 
 from calib.arm import CalibratedArm
 from calib.changes import MIN_TIP_MM
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.mdp.actions import SHIFT_LIMIT
 from train.agent.registry import learns_from_demonstrations
 from train.runs import run as runs
-from train.runs.checkpoint import RunError
 from train.runs.folder import DEMONSTRATIONS_FILE, Run
 
 # A policy needs no training while no error grows by more than this factor; chosen by hand.
@@ -27,12 +27,12 @@ def renewed(run: Run, arm: CalibratedArm) -> Run:
     Its actions stay readings of the same spring lengths: the range of lengths remains that of the training.
 
     Raises:
-        RunError: it is another arm.
+        InputError: it is another arm.
     """
     counts = [(spec.structure.n_sections, spec.n_chambers, spec.n_springs) for spec in (run.spec, arm.spec)]
     if counts[0] != counts[1]:
         expected, got = (f"{s} sections, {c} chambers and {n} springs" for s, c, n in counts)
-        raise RunError(f"--calibration: got an arm of {got}, expected {expected}, as in {run.path}")
+        raise InputError(f"--calibration: got an arm of {got}, expected {expected}, as in {run.path}")
     limits = {name: getattr(run.spec.springs, name) for name in ("length_min_m", "length_max_m")}
     return Run(run.path, run.config, arm._replace(spec=arm.spec.replace(springs=limits)))
 

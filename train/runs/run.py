@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from train.agent.learner import LearnerConfig
@@ -24,7 +25,6 @@ from train.agent.registry import name_of
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
 from train.epoch.job import State
-from train.runs.checkpoint import RunError
 from train.runs.folder import EVALUATION_FILE, Run
 from train.runs.task import Task, task_of
 
@@ -48,7 +48,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
 
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
-        RunError: arms in motion diverge.
+        InputError: arms in motion diverge.
     """
 
     def begin() -> tuple[int, State]:
@@ -94,7 +94,7 @@ def train_together(
 
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
-        RunError: arms in motion diverge.
+        InputError: arms in motion diverge.
     """
     (first, shared), learner = members[0], job.learner
     config, n_epochs = first.config, first.config.learner.n_epochs
@@ -143,10 +143,10 @@ def noted(console: Console, text: str) -> Iterator[None]:
 
 
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
-    """Raise RunError where most of an epoch's actions of arms in motion led to no finite state."""
+    """Raise InputError where most of an epoch's actions of arms in motion led to no finite state."""
     n_actions = config.learner.n_env_steps(1)
     if config.env.moves and n_unsettled > n_actions / 2:
-        raise RunError(
+        raise InputError(
             f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
             f"{n_actions} actions diverged, expected a shorter time step for this arm"
         )
@@ -169,8 +169,8 @@ def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
     """Return the task of a run.
 
     Raises:
-        RunError: its demonstrations cannot be read.
-        ConfigError: it cannot be split evenly over the devices of the mesh.
+        InputError: its demonstrations cannot be read.
+        InputError: it cannot be split evenly over the devices of the mesh.
     """
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations(), mesh)
 
@@ -184,7 +184,7 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State,
         donors: `agent`: run whose networks are taken; `reward`: run whose learned reward is taken.
 
     Raises:
-        RunError: a donor has no such part, or one of another size.
+        InputError: a donor has no such part, or one of another size.
     """
     state, learner = task.job.init(jax.random.PRNGKey(seed)), task.job.learner
     for option, donor in donors.items():
@@ -192,11 +192,11 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State,
         parts = {name: x for name, x in saved.items() if (name == "reward") == (option == "reward")}
         if not parts:
             expected = "a run of `imitate` that learned one"
-            raise RunError(f"{donor.path}: {option}: got none, expected {expected}")
+            raise InputError(f"{donor.path}: {option}: got none, expected {expected}")
         try:
             state = state._replace(learner=learner.adopt(state.learner, parts))
         except ValueError as error:
-            raise RunError(f"{donor.path}: {error}") from error
+            raise InputError(f"{donor.path}: {error}") from error
     return (state := task.job.place(state)), task.job.parts(state)
 
 

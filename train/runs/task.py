@@ -39,7 +39,7 @@ def task_of(
         mesh: devices to train on; None is one device.
 
     Raises:
-        ConfigError: the learner needs demonstrations and has none, or the run cannot be split evenly over the
+        InputError: the learner needs demonstrations and has none, or the run cannot be split evenly over the
             devices of the mesh.
     """
     epoch = epoch_of(config.learner, env, mesh, demonstrations)

@@ -13,15 +13,8 @@ import numpy as np
 import pytest
 
 from benchmarks.harness import stages
-from benchmarks.harness.stages import (
-    JobError,
-    WorkStage,
-    claim,
-    command,
-    load_arrays,
-    run_stages,
-    save_arrays,
-)
+from benchmarks.harness.stages import WorkStage, claim, command, load_arrays, run_stages, save_arrays
+from mjx_softarm._support.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -57,16 +50,16 @@ def test_stages_run_elsewhere_group_by_group_and_only_where_a_result_is_missing(
     (tmp_path / "c").unlink()  # one of two results
     run_stages(tmp_path, Size(), groups)
     assert (tmp_path / "calls.txt").read_text().splitlines() == ["a", "b c", "b c"]
-    with pytest.raises(JobError, match="bad: ValueError: not today"):
+    with pytest.raises(InputError, match="bad: ValueError: not today"):
         run_stages(tmp_path, Size(), [[WorkStage("bad", ("d",), fail)]])
-    with pytest.raises(JobError, match="empty: JobError: got no e in .*, expected its results"):
+    with pytest.raises(InputError, match="empty: InputError: got no e in .*, expected its results"):
         run_stages(tmp_path, Size(), [[WorkStage("empty", ("e",), leave, ("f",))]])
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path):
     claim(tmp_path, Size(), more=("twins",))
     claim(tmp_path, Size(twins=(0, 1)), more=("twins",))
-    with pytest.raises(JobError, match=r"settings.json: got n_points 3, expected n_points 40;"):
+    with pytest.raises(InputError, match=r"settings.json: got n_points 3, expected n_points 40;"):
         claim(tmp_path, Size(40), more=("twins",))
 
 
@@ -87,7 +80,7 @@ def test_a_command_with_results_goes_on_and_another_is_named(tmp_path, monkeypat
         command(log, "calib", "run", 3, makes=made)
     else:
         told = rf"(?s)python -m calib run 3: got exit status {status}, expected .*ends with\nits last words"
-        with pytest.raises(JobError, match=told):
+        with pytest.raises(InputError, match=told):
             command(log, "calib", "run", 3, makes=made)
 
 
@@ -96,7 +89,7 @@ def test_arrays_come_back_and_those_of_an_older_version_are_refused(tmp_path):
     save_arrays(tmp_path / "x.npz", kind(np.arange(3), np.array([np.nan])))
     a, b = load_arrays(kind, tmp_path / "x.npz")
     assert a.tolist() == [0, 1, 2] and np.isnan(b).all()
-    with pytest.raises(JobError, match="x.npz: got no c, expected the arrays"):
+    with pytest.raises(InputError, match="x.npz: got no c, expected the arrays"):
         load_arrays(namedtuple("newer", "a c"), tmp_path / "x.npz")
 
 

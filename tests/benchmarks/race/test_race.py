@@ -10,17 +10,9 @@ from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import Worker, WorkerError
 from benchmarks.race import race
 from benchmarks.race.contestants import CONTESTANTS, Contestant, HeldOut, prepare, settings_of
-from benchmarks.race.race import (
-    PeerTarget,
-    RaceError,
-    RaceLimits,
-    crossing,
-    judge,
-    limits_of,
-    run,
-    train,
-)
+from benchmarks.race.race import PeerTarget, RaceLimits, crossing, judge, limits_of, run, train
 from mjx_softarm._support import xla
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
@@ -197,8 +189,8 @@ def test_results_are_kept_and_those_of_another_commit_size_or_machine_refused(as
     before = run(tmp_path, (0,), CONTESTANTS, 8)
     asked.clear()
     assert run(tmp_path, (0,), CONTESTANTS, 8) == before and not asked
-    with pytest.raises(RaceError, match="got n_goals 8, expected n_goals 9"):
+    with pytest.raises(InputError, match="got n_goals 8, expected n_goals 9"):
         run(tmp_path, (0,), CONTESTANTS, 9)
     made["commit"] = "b"
-    with pytest.raises(RaceError, match="ours-quick-seed0.json: got commit a, expected commit b; choose"):
+    with pytest.raises(InputError, match="ours-quick-seed0.json: got commit a, expected commit b; choose"):
         run(tmp_path, (0,), CONTESTANTS, 8)

@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from calib.arm import CalibratedArm
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
 from tests.train.small import SHORT
@@ -20,10 +21,9 @@ from train.agent.imitation import ImitationConfig
 from train.agent.networks import Actor
 from train.agent.registry import LEARNERS, Entry, with_replay
 from train.agent.tqc import TQCConfig
-from train.config import ConfigError, TrainConfig
+from train.config import TrainConfig
 from train.epoch.replay_epoch import ReplayConfig
 from train.runs.arm_model import DistilledArm
-from train.runs.checkpoint import RunError
 from train.runs.evaluate import Evaluator
 from train.runs.export import export_run
 from train.runs.folder import Run
@@ -127,24 +127,24 @@ def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, arm):
 
 def test_a_policy_that_the_file_cannot_hold_is_refused(run, tmp_path, arm, monkeypatch):
     monkeypatch.setattr(run, "policy", lambda: {"params": {"other": {}}})
-    with pytest.raises(RunError, match="got .*'other'.* expected hidden_0"):
+    with pytest.raises(InputError, match="got .*'other'.* expected hidden_0"):
         export_run(run, arm, tmp_path / "policy.npz")
 
 
 def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
     learner = TQCConfig(**{**dataclasses.asdict(SETTINGS), "hindsight": SETTINGS.hindsight})
     other = task_of(dataclasses.replace(CONFIG, learner=learner), task.job.env)
-    with pytest.raises(RunError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
+    with pytest.raises(InputError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
         run.checkpoints.restore(other.job.like())
-    with pytest.raises(RunError, match=f"{run.path}: got a policy without critics"):
+    with pytest.raises(InputError, match=f"{run.path}: got a policy without critics"):
         begin_with(other, 0, {"agent": run})
-    with pytest.raises(RunError, match=f"{run.path}: got a donor of policy, expected none"):
+    with pytest.raises(InputError, match=f"{run.path}: got a donor of policy, expected none"):
         begin_with(task, 0, {"agent": run})
-    with pytest.raises(RunError, match=f"{run.path}: reward: got none, expected a run of `imitate`"):
+    with pytest.raises(InputError, match=f"{run.path}: reward: got none, expected a run of `imitate`"):
         begin_with(other, 0, {"reward": run})
 
 
 def test_a_learner_from_demonstrations_needs_some(task):
     imitation = dataclasses.replace(CONFIG, learner=ImitationConfig(total_env_steps=4_096))
-    with pytest.raises(ConfigError, match="learner: got 'imitation' without demonstrations, expected a file"):
+    with pytest.raises(InputError, match="learner: got 'imitation' without demonstrations, expected a file"):
         task_of(imitation, task.job.env)

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import ReachEnv
 from tests.train import small
 from tests.train.small import SHORT, new_job
 from train.__main__ import main
 from train.agent.registry import epoch_of
-from train.config import ConfigError
 from train.epoch.devices import mesh_of, split
 from train.runs.folder import Run
 
@@ -153,9 +153,7 @@ def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, jobs, tra
 def test_what_cannot_be_split_evenly_is_named(env, name):
     learner = dataclasses.replace(LEARNER, **{name: getattr(LEARNER, name) + 4})
     config = dataclasses.replace(CONFIG, learner=learner)
-    with pytest.raises(
-        ConfigError, match=rf"^learner\.{name}: got .* expected a multiple of the {N_DEVICES}"
-    ):
+    with pytest.raises(InputError, match=rf"^learner\.{name}: got .* expected a multiple of the {N_DEVICES}"):
         new_job(config, env, mesh=mesh_of(str(N_DEVICES)))
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from tests.train.small import CONFIG, SHORT, new_job
 from train.epoch.job import FreshPoses
-from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -112,11 +112,11 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
 
 def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tmp_path):
     run, state = Run.create(tmp_path, CONFIG, CalibratedArm(job.env.spec)), start(job)
-    with pytest.raises(RunError, match="got no checkpoint"):
+    with pytest.raises(InputError, match="got no checkpoint"):
         run.checkpoints.restore(state)
     run.checkpoints.save(0, state, job.parts(state))
     for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
-        with pytest.raises(RunError, match=f"{tmp_path}: got a checkpoint of other parts or sizes"):
+        with pytest.raises(InputError, match=f"{tmp_path}: got a checkpoint of other parts or sizes"):
             run.checkpoints.restore(other)
 
 

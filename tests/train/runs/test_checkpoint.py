@@ -16,7 +16,6 @@ from train.agent.analytic import AnalyticConfig
 from train.agent.registry import epoch_of
 from train.config import TrainConfig
 from train.epoch.replay_epoch import ReplayState
-from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 
 CONFIG, ARM = TrainConfig(), CalibratedArm(ArmSpec.default())
@@ -25,12 +24,12 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):
-    with pytest.raises(RunError, match="config.json: got 'No such file.*expected the folder of a run"):
+    with pytest.raises(InputError, match="config.json: got 'No such file.*expected the folder of a run"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text("{")
-    with pytest.raises(RunError, match="config.json: got a damaged config or another version's"):
+    with pytest.raises(InputError, match="config.json: got a damaged config or another version's"):
         Run.open(tmp_path)
-    with pytest.raises(RunError, match="got a folder with a run, .*--resume"):
+    with pytest.raises(InputError, match="got a folder with a run, .*--resume"):
         Run.create(tmp_path, CONFIG, ARM)
 
 
@@ -62,7 +61,7 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
     for name, learner_config in configs.items():
         learner = epoch_of(learner_config, short_env, None, shown).learner
         run = Run.create(tmp_path / name, config, CalibratedArm(short_env.spec))
-        with pytest.raises(RunError, match="got no checkpoint, expected one"):
+        with pytest.raises(InputError, match="got no checkpoint, expected one"):
             run.policy()
         state = jax.jit(learner.init)(jax.random.PRNGKey(0))
         run.checkpoints.save(1, ReplayState(None, state, None, (), zero, zero), learner.parts(state))
@@ -92,7 +91,7 @@ def test_a_damaged_checkpoint_is_called_so(saved, item, files, spoil):
     folder = run.path / "checkpoints/20" / item
     for file in folder.glob(files):
         spoil(file)
-    with pytest.raises(RunError, match=rf"{folder}: got a damaged checkpoint .*back to epoch 10"):
+    with pytest.raises(InputError, match=rf"{folder}: got a damaged checkpoint .*back to epoch 10"):
         reopened = Run.open(run.path)
         reopened.checkpoints.parts() if item == "parts" else reopened.checkpoints.restore(like)
 
@@ -100,7 +99,7 @@ def test_a_damaged_checkpoint_is_called_so(saved, item, files, spoil):
 def test_a_checkpoint_of_other_sizes_is_called_another_version_s(saved):
     run, like = saved
     other = like._replace(learner={"other": like.learner["weight"]})
-    with pytest.raises(RunError, match="got a checkpoint of other parts or sizes"):
+    with pytest.raises(InputError, match="got a checkpoint of other parts or sizes"):
         run.checkpoints.restore(other)
 
 
@@ -111,11 +110,11 @@ def test_a_run_without_its_checkpoints_begins_anew_only_if_it_had_none(tmp_path)
         run.log({"epoch": epoch})
     run.check_begins_anew()
     run.log({"epoch": CONFIG.evaluation_epochs + 1})
-    with pytest.raises(RunError, match="got no checkpoint of a run with 11 epochs .*another --out"):
+    with pytest.raises(InputError, match="got no checkpoint of a run with 11 epochs .*another --out"):
         run.check_begins_anew()
 
 
 def test_a_run_that_began_with_another_s_policy_does_not_begin_anew_without_it(tmp_path):
     run = Run.create(tmp_path, CONFIG, ARM, begins_with={"agent": tmp_path / "other"})
-    with pytest.raises(RunError, match="got no checkpoint of a run with 0 epochs"):
+    with pytest.raises(InputError, match="got no checkpoint of a run with 0 epochs"):
         run.check_begins_anew()

@@ -9,17 +9,19 @@ from rich.console import Console
 
 from calib.arm import CalibratedArm
 from mjx_softarm import ArmSpec
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.actions import SHIFT_LIMIT
 from tests.train.small import CONFIG, SHORT
-from train.runs.checkpoint import RunError
 from train.runs.folder import Run
 from train.runs.renew import policy_still_accurate, renewed
 
 
 def test_another_arm_is_refused(tmp_path):
     run = Run.create(tmp_path / "run", CONFIG, CalibratedArm(SHORT))
-    with pytest.raises(RunError, match="got an arm of 3 sections, 9 chambers and 9 springs, expected 1 sect"):
+    with pytest.raises(
+        InputError, match="got an arm of 3 sections, 9 chambers and 9 springs, expected 1 sect"
+    ):
         renewed(run, CalibratedArm(ArmSpec.default()))
 
 

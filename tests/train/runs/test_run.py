@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from tests.train.small import CONFIG
 from train.runs import run
-from train.runs.checkpoint import RunError
 
 
 @pytest.mark.parametrize(
@@ -28,5 +28,5 @@ def test_an_epoch_in_which_most_arms_in_motion_diverge_ends_the_run_and_names_th
     run.refuse_divergence(moving, 8.0)
     run.refuse_divergence(CONFIG, 16.0)  # at rest
     message = rf"env\.simulation_step_s: got 0\.02, with which 9 of {moving.learner.n_env_steps(1)}"
-    with pytest.raises(RunError, match=message):
+    with pytest.raises(InputError, match=message):
         run.refuse_divergence(moving, 9.0)
