@@ -17,7 +17,7 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.spec import ArmSpec
 
 FIRMWARE = Path(__file__).parent / "deploy" / "drivers" / "firmware" / "firmware.ino"
-FAR_LIMIT = 0.25  # distance of a limit from the springs' range, as a share of it, that is told; by hand
+FAR_LIMIT = 0.25  # distance of a limit from the springs' range, as a share of it, that is reported; by hand
 MAX_COMBINATIONS, N_RANDOM = 1_000_000, 3**9  # of pressures; as many as those of the paper's arm
 
 

@@ -1,4 +1,4 @@
-"""Command lines: tyro reads the options of a command; an error is told on stderr, with exit status 2.
+"""Command lines: tyro reads the options of a command; an error is printed on stderr, with exit status 2.
 
 A command is a function, or a dataclass that is called once its options are read. Type annotations say which
 values an option may have, docstrings say what it means.
@@ -94,7 +94,7 @@ def guarded(run: Callable[[], int]) -> int:
 
 
 def _status(run: Callable[[], int]) -> int:
-    """Return a command's exit status; errors that its user can put right are told on stderr."""
+    """Return a command's exit status; errors that its user can put right are printed on stderr."""
     try:
         return run()
     except SystemExit as stop:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import viser
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
-HINT = "try next: hang 500 g with the payload slider; the arm tells it, and corrects the circle"
+HINT = "try next: hang 500 g with the payload slider; the loop estimates it and corrects the circle"
 
 
 @dataclass(frozen=True)

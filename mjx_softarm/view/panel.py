@@ -59,7 +59,7 @@ class Panel:
                 f"<br>tip <b>{off_mm:.1f} mm</b> from the goal, as {name}" for name, off_mm in known
             )
             if np.isfinite(look.load_kg):
-                rows += f"<br>payload <b>{1e3 * look.load_kg:.0f} g</b>, as told by springs and pressures"
+                rows += f"<br>payload <b>{1e3 * look.load_kg:.0f} g</b>, estimated from springs and pressures"
         said = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
         self._text.content = (
             "<div style='padding:0.5em 0.8em 0.2em;font-size:12px;line-height:1.5;overflow-wrap:anywhere'>"

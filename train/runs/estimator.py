@@ -2,7 +2,7 @@
 
 The networks (`mjx_softarm.sensing.estimator`, `mjx_softarm.sensing.load`) learn equilibria over the whole
 workspace, and are tested on held-out ones. No calibration is perfect. So the load network learns how well
-the log of the arm tells the pressures that hold it (`mjx_softarm.sensing.held_pressures`), or, without a log,
+the log of the arm shows the pressures that hold it (`mjx_softarm.sensing.held_pressures`), or, without a log,
 by how much arms differ whose chambers are off. The pose network has no pressures as inputs: it would mistake
 a chamber's error for a change of shape.
 """
@@ -128,7 +128,7 @@ def loaded_poses(arm: CalibratedArm, n: int, seed: int) -> LoadedPool:
 
 
 def _chambers_off(arm: CalibratedArm) -> float:
-    """Return the share by which chambers may be off: a log of the arm tells its own."""
+    """Return the share by which chambers may be off: a log of the arm shows its own."""
     return CHAMBERS_OFF if arm.held is None else 0.0
 
 
