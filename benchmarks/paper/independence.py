@@ -60,7 +60,7 @@ class PressureEnv(ReachEnv):
 
 
 class Commands(NamedTuple):
-    """What a policy commands, and how it learns."""
+    """Commands of a policy, and settings that it learns with."""
 
     settings: tuple[str, ...]  # NAME=VALUE
     env: Callable[..., ReachEnv] = ReachEnv

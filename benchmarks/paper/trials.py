@@ -1,4 +1,4 @@
-"""What the paper's experiments compare: settings, ways to find references, and trials of them on twins.
+"""Parts that the paper's experiments compare: settings, ways to find references, and trials of them on twins.
 
 All stages share the folder of a benchmark, so that the same command goes on where it ended:
 

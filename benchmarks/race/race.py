@@ -242,8 +242,8 @@ def judge(wanted: PeerTarget, results: Sequence[Result]) -> dict[str, str]:
     text = f"{peer}: wall time to {TARGET_MM} mm, with start-up, at least {times:g} times that of {ours}"
     for result in results:
         if "failed" in result and result["contestant"] in (ours, peer):
-            told = f"{result['contestant']}, seed {result['seed']}: {result['failed']}"
-            return target(text, told, False if result["contestant"] == ours else None)
+            failure = f"{result['contestant']}, seed {result['seed']}: {result['failed']}"
+            return target(text, failure, False if result["contestant"] == ours else None)
     curves: dict[tuple[str, int], Any] = {(r["contestant"], r["seed"]): r.get("points") for r in results}
     ratios, all_reached = [], True
     for seed in sorted({seed for _, seed in curves}):

@@ -25,7 +25,7 @@ from jax.sharding import Mesh
 
 from benchmarks.harness.common import mesh_of_cores
 from benchmarks.harness.rounds import Facts, serve
-from benchmarks.speed.truth import TOLD, settle_function
+from benchmarks.speed.truth import REPORTED, settle_function
 from mjx_softarm._support import draws, xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.gym import EPISODE_LENGTH
@@ -42,7 +42,7 @@ N_STEPS = {"quasistatic": 8, "dynamic": 1}  # environment steps of each arm in a
 N_FEW = 1024  # more arms take one step in a call
 N_POSES = 256
 N_STARTS = 64  # arms that are reset; more arms start as these do
-N_TOLD = 256  # arms whose tips are reported
+N_REPORTED = 256  # arms whose tips are reported
 ROUND_S = 1.0  # least time of a round
 N_VECTOR_STEPS, N_UPDATES = 4, 16  # of an epoch of `learn`: actions of each arm, gradient steps after each
 
@@ -154,8 +154,8 @@ def steps(engine: Any, mode: Any, n_arms: str) -> tuple[Facts, Callable[[], Fact
     facts: Facts = {"compile_s": round(program.compile_s, 1)}
     facts |= {"unsettled": int(unsettled.sum()), "saturated_chambers": round(float(np.mean(saturated)), 2)}
     if mode == "quasistatic":  # first step first
-        rows = (np.asarray(x, float).reshape(-1, x.shape[-1])[:N_TOLD] for x in ends)
-        facts |= {name: x.tolist() for name, x in zip(TOLD, rows, strict=True)}
+        rows = (np.asarray(x, float).reshape(-1, x.shape[-1])[:N_REPORTED] for x in ends)
+        facts |= {name: x.tolist() for name, x in zip(REPORTED, rows, strict=True)}
     return facts, lambda: rates(program, ROUND_S)
 
 

@@ -26,7 +26,7 @@ from benchmarks.harness.peers import PeerError, peer_python
 from benchmarks.harness.rounds import Facts, Worker, take_turns
 from benchmarks.speed.jax_worker import N_POSES, gradient_steps, rates, resized, rollout, training
 from benchmarks.speed.mujoco_arms import write_arm
-from benchmarks.speed.truth import TOLD, told_error
+from benchmarks.speed.truth import REPORTED, reported_error
 from mjx_softarm._support import cli, xla
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
@@ -241,7 +241,7 @@ def figures_of(
     if not answers:
         return {"failed": failed[worker.name]}
     figures = over_rounds([worker.facts | facts for facts in answers])
-    return figures | told_error(ArmSpec.default(), [worker.facts, *answers])
+    return figures | reported_error(ArmSpec.default(), [worker.facts, *answers])
 
 
 def over_rounds(rounds: Sequence[Facts]) -> dict[str, Any]:
@@ -250,7 +250,7 @@ def over_rounds(rounds: Sequence[Facts]) -> dict[str, Any]:
     for name, value in rounds[-1].items():
         if name.endswith("_per_s"):
             merged[name] = digits(float(np.median([facts[name] for facts in rounds])))
-        elif name not in TOLD:
+        elif name not in REPORTED:
             merged[name] = value
     return merged
 

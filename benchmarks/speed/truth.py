@@ -25,7 +25,7 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import ArmSpec
 
 QUANTILES = {"median_mm": 0.5, "p95_mm": 0.95, "max_mm": 1.0}
-TOLD = ("reference_m", "tip_mm")  # facts that a worker tells of its settled arms
+REPORTED = ("reference_m", "tip_mm")  # facts that a worker reports of its settled arms
 
 
 class Truth(NamedTuple):
@@ -80,12 +80,12 @@ def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
     return {**errors, "without_truth": int(np.sum(~truth.settled))}
 
 
-def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def reported_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Return the error of the tips that workers told; nothing if they told none."""
     told = [facts for facts in told if "tip_mm" in facts]
     if not told:
         return {}
-    reference_m, tip_mm = (np.concatenate([facts[name] for facts in told]) for name in TOLD)
+    reference_m, tip_mm = (np.concatenate([facts[name] for facts in told]) for name in REPORTED)
     return error_figures(tip_mm, true_rest(spec, reference_m))
 
 

@@ -183,7 +183,7 @@ def test_an_arm_at_its_goal_terminates_and_the_others_go_on(envs):
 
 
 def test_a_goal_that_does_not_end_the_episode_does_not_terminate(envs):
-    """The same arm, goal and action with both settings."""
+    """One arm, goal and action with both settings of `goal_ends`."""
     ends = {}
     for goal_ends in (True, False):
         env = SoftArmEnv(config=dataclasses.replace(CONFIG, goal_ends=goal_ends))

@@ -24,7 +24,7 @@ from benchmarks.speed.mujoco_arms import (
 )
 from benchmarks.speed.mujoco_worker import Step, timed
 from benchmarks.speed.throughput import moving_row, over_rounds, side_by_side
-from benchmarks.speed.truth import error_figures, random_references, told_error, true_rest
+from benchmarks.speed.truth import error_figures, random_references, reported_error, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig, ReachEnv
 
@@ -73,8 +73,8 @@ def test_arms_stepped_in_time_rest_where_the_solver_says_alone_and_in_company(mo
 def test_the_error_of_what_programs_told_is_that_of_their_tips(reference, truth):
     off_mm = truth.tip_mm + [0, 0, 2]
     told = [{"reference_m": reference[k], "tip_mm": off_mm[k]} for k in (slice(0, 2), slice(2, 4))]
-    assert told_error(SPEC, [{"arms": 2}, *told])["median_mm"] == pytest.approx(2.0, abs=1e-3)
-    assert told_error(SPEC, [{"arms": 2}]) == {}
+    assert reported_error(SPEC, [{"arms": 2}, *told])["median_mm"] == pytest.approx(2.0, abs=1e-3)
+    assert reported_error(SPEC, [{"arms": 2}]) == {}
 
 
 def test_an_arm_rests_when_no_spring_has_moved_for_long_enough():
