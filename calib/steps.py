@@ -20,7 +20,7 @@ from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
-from calib.fit.motion.actuators import fit_actuators
+from calib.fit.motion.actuators import ArmLag, fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
@@ -41,6 +41,7 @@ from calib.report import sections
 from calib.report.page import Section
 from mjx_softarm.logs.pose_pairs import PosePairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
+from mjx_softarm.sensing.held_pressures import residual
 from mjx_softarm.sensing.load import KNOWN
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import correct, extrapolation
@@ -107,13 +108,46 @@ def chambers(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
 
 
 def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
-    """Fit pumps or regulators to commanded and measured pressures."""
-    tracks = find_tracks(measurements.logs, arm.spec)
+    """Fit pumps or regulators to commanded and measured pressures, or to commands and springs."""
+    spec = arm.spec
+    tracks, lag = find_tracks(measurements.logs, spec), None
+    if not tracks and (resting_kpa := _pressures_by_springs(measurements, spec, seed)):
+        # No pressure was measured: the springs are the gauge, and the shape shows the arm's own lag
+        tracks = find_tracks(measurements.logs, spec, resting_kpa)
+        shape = fit_shape(measurements.logs, spec) if tracks else None
+        known = spec.shape_lag_s, PRIOR
+        if shape is not None and shape.is_better:
+            known = shape.lag_s, shape.log_std
+        lag = ArmLag.of_shape(*known)
     if not tracks:
-        needed = "No log has commanded and measured pressures at the control rate."
-        return StepResult(arm, Section("Actuators", f"{NOT_FITTED} {needed}"))
-    fit = fit_actuators(tracks, arm.spec, seed)
+        needed = "No log has commands and pressures, or commands and springs, at the control rate."
+        cost = (
+            "how fast pumps or regulators follow is not known. With slow ones a goal that moves is missed by "
+            "up to 10 mm: `deploy record` logs what shows it"
+        )
+        return StepResult(arm, Section("Actuators", f"{NOT_FITTED} {needed}", notes=(cost,)))
+    fit = fit_actuators(tracks, spec, seed, lag)
     return StepResult(arm._replace(spec=fit.spec), sections.actuators(fit))
+
+
+def _pressures_by_springs(
+    measurements: Measurements, spec: ArmSpec, seed: int
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the pressures (n, c) [kPa] of the arm at rest by its spring lengths (n, n_springs) [m].
+
+    They are the simulated ones, and a process of what these miss at the poses at rest; None with too few of
+    them.
+    """
+    poses, rows, settled, _, _ = _settled_poses(measurements, spec)
+    if len(rows) < MIN_POSES:
+        return None
+    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[rows], settled.pressure_kpa, seed)
+
+    def resting_kpa(spring_m: np.ndarray) -> np.ndarray:
+        kpa = np.asarray(simulate_poses(spec, spring_m).pressure_kpa, float)
+        return kpa + residual(held.held, spring_m, kpa).mean_kpa.reshape(kpa.shape) if held.is_better else kpa
+
+    return resting_kpa
 
 
 def damping(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:

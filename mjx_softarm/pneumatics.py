@@ -5,7 +5,8 @@ atmospheric pressure, the unit of a pump's flow. With the bellows' effective are
 the volume is V = area l + slope (l - rest)^2 / 2. So V' = A, and a closed chamber conserves mechanical work.
 
 Each chamber has an actuator, a pump or a regulator, which acts on a command after a dead time. An actuator
-changes the amount of gas; a chamber that changes its length changes its pressure at once.
+changes the amount of gas; a chamber that changes its length changes its pressure at once. A stiff regulator
+makes up for some of that: a share s of the change of volume counts, as if the chamber had the volume V^s.
 
 Source: the paper's section on the hardware: each chamber is controlled by a pump unit of 12 L/min, whose
 valves switch within 10 ms. Regulators: step responses in the logs of ASU-RISE-Lab/4-chamber-softarm-control.
@@ -70,12 +71,27 @@ class Actuators:
         """Pressure at rest less its command, () or (n,); None for none."""
         return None
 
+    def felt(self, volume_m3: Array) -> Array:
+        """Return volumes (..., n), as gas and pressures depend on volumes (..., n) [m^3] of the chambers."""
+        return volume_m3
+
+    def gas_stiffness(self, gas_m3: Array, volume_m3: Array, area_m2: Array) -> Array:
+        """Return the stiffness (..., n) of closed chambers by their length, over the atmosphere's pressure.
+
+        Args:
+            gas_m3 (..., n): gas.
+            volume_m3 (..., n) [m^3]: volumes of the chambers.
+            area_m2 (..., n): effective areas, V'; the stiffness has the unit of its square over that of a
+                volume.
+        """
+        return gas_m3 * (area_m2 / volume_m3) ** 2
+
     def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
         """Return the gas (..., n) after a time dt_s.
 
         Args:
             gas_m3 (..., n) [m^3]: gas at the start, as its volume at atmospheric pressure.
-            volume_m3 (..., n) [m^3]: volumes of the chambers.
+            volume_m3 (..., n) [m^3]: volumes of the chambers, as `felt`.
             command_kpa (..., n) [kPa]: commands in force; the dead time is over.
             dt_s: duration.
         """
@@ -119,7 +135,8 @@ class Regulator(Actuators):
 
         p' = clip((e - clip(e, -d, d)) / T, -vent, fill)
 
-    Within the deadband the chamber is closed.
+    Within the deadband the chamber is closed. `volume_share` is 0 for a regulator so fast inside that the
+    chamber's volume does not matter; the lag is then that of its command.
     """
 
     kind: ClassVar[str] = "regulator"
@@ -130,6 +147,7 @@ class Regulator(Actuators):
     vent_kpa_per_s: PerChamber | Array = positive(per="chambers")  # greatest rate of a falling pressure
     deadband_kpa: PerChamber | Array = anything(per="chambers", low=0.0)
     offset_kpa: PerChamber | Array = field(default=0.0, metadata={"rule": Rule(per="chambers")})
+    volume_share: Array | float = field(default=1.0, metadata={"rule": Rule(low=0.0, high=1.0)})
 
     @property
     def delay_s(self) -> Array | float:
@@ -138,6 +156,12 @@ class Regulator(Actuators):
     @property
     def rest_offset_kpa(self) -> Array | float:
         return self.offset_kpa
+
+    def felt(self, volume_m3: Array) -> Array:
+        return volume_m3**self.volume_share
+
+    def gas_stiffness(self, gas_m3: Array, volume_m3: Array, area_m2: Array) -> Array:
+        return self.volume_share * gas_m3 / self.felt(volume_m3) * area_m2**2 / volume_m3
 
     def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
         numbers: Any = self  # numbers are () or (n,)
@@ -194,8 +218,8 @@ class Pneumatics:
         self._line = np.tile(self._commanded_kpa, (self._wait.max() + 1, 1))  # commands, newest first
 
     def volume_m3(self, length_m: np.ndarray) -> np.ndarray:
-        """Return volumes (n,) [m^3] of chambers with lengths (n,) [m]."""
-        return volume_m3(length_m, *self._bellows)
+        """Return volumes (n,) [m^3] of chambers with lengths (n,) [m], as the actuators feel them."""
+        return self._actuators.felt(volume_m3(length_m, *self._bellows))
 
     def command(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], relative to the atmosphere."""

@@ -63,7 +63,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
         if (home / name).exists():
             continue
         arm = _stand_in(settings)(twin, spec, session=S2R_SESSION)
-        recording = record(arm, spec, random_pressures(spec, n, seed=twin), transients=name == MOVING)
+        recording = record(arm, spec, random_pressures(spec, n, seed=twin))
         if cause := recording.ending.cause:
             raise InputError(f"log of {n} poses: got a recording that ended early ({cause}), expected all")
         write_log(home / name, recording.log)

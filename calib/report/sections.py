@@ -268,6 +268,9 @@ def actuators(fit: ActuatorFit) -> Section:
     titles = [text for name in each for text in ((name, "+-") if widths else (name,))]
 
     # Errors of each kind of actuator, then the section
+    against = "measured pressures"
+    if fit.arm_lag_s is not None:
+        against = f"pressures by the springs, which lag by {fit.arm_lag_s:.2f} s, as none were measured"
     errors = (
         ("held-out seconds, command taken for the pressure", fit.held_out_rms_kpa["command"]),
         ("held-out seconds, before", fit.held_out_rms_kpa["specification"]),
@@ -277,8 +280,8 @@ def actuators(fit: ActuatorFit) -> Section:
     )
     return Section(
         "Actuators",
-        f"{fit.n_tracks} tracks of commanded and measured pressures, {fit.time_s:.0f} s in all: "
-        f"{found.kind}s driven with the commands against the measured pressures. Intervals are 95 %. "
+        f"{fit.n_tracks} tracks of commands and pressures, {fit.time_s:.0f} s in all: "
+        f"{found.kind}s driven with the commands against the {against}. Intervals are 95 %. "
         f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s). {_kept(fit)}",
         (
             ReportTable(("", *titles, "held-out RMS [kPa]"), tuple(rows)),

@@ -245,17 +245,17 @@ def _record(
     options: Arms,
     out: Path,
     spec: cli.SpecFile = None,
-    poses: int = 500,
+    poses: int = 100,
     seed: int = 0,
-    transients: bool = False,
 ) -> int:
-    """Log static poses at random pressures, for calibration; the first ten grow from a tenth of the range.
+    """Log an arm at random poses and between them, for calibration; the first ten poses grow from a tenth.
+
+    It ends once more poses bring nothing, or with Ctrl-C: what was recorded is written.
 
     Args:
-        out: log to write, CSV or npz
-        poses: number of random poses
+        out: log of every tick to write, npz or CSV; npz takes 0.25 MB a pose
+        poses: number of random poses, at most
         seed: seed of the poses
-        transients: log every tick, not the static poses alone
     """
     # Checks, before the arm moves
     if poses < 1:
@@ -276,7 +276,7 @@ def _record(
 
     # The recording and its results
     targets_kpa = growing(random_pressures(arm_spec, poses, seed))
-    result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out))
+    result = record(driver, arm_spec, targets_kpa, tell, partial(save_log, out))
     finish(driver, tell)
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)

@@ -1,7 +1,8 @@
 """Drives of an arm to rest, without a policy. NumPy only.
 
-A law turns spring lengths into the next pressures. `ramp` moves the pressures themselves. `Hold` is the
-sensor-space law on references that move in step: the arm passes the shapes between the first and the last.
+A law turns spring lengths into the next pressures. `ramp` moves the pressures themselves, after a step.
+`Hold` is the sensor-space law on references that move in step: the arm passes the shapes between the first
+and the last.
 """
 
 from __future__ import annotations
@@ -27,13 +28,18 @@ MEAN_S = 0.2  # time constant of that running mean
 Law = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray, bool]]
 
 
-def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
-    """Return the law that takes the pressures to targets (n_chambers,) [kPa] as slowly as venting does."""
-    step_kpa = VENT_KPA_PER_S * dt_s
+def ramp(target_kpa: np.ndarray, dt_s: float, step_kpa: float = 0.0) -> Law:
+    """Return the law that takes the pressures to targets (n_chambers,) [kPa] as slowly as venting does.
+
+    It begins with a step of up to `step_kpa`.
+    """
+    next_kpa = step_kpa + VENT_KPA_PER_S * dt_s  # change of the next tick
 
     def law(_spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
+        nonlocal next_kpa
+        change_kpa, next_kpa = next_kpa, VENT_KPA_PER_S * dt_s
         arrived = np.array_equal(in_force_kpa, target_kpa)
-        return np.clip(target_kpa, in_force_kpa - step_kpa, in_force_kpa + step_kpa), arrived
+        return np.clip(target_kpa, in_force_kpa - change_kpa, in_force_kpa + change_kpa), arrived
 
     return law
 

@@ -1,15 +1,18 @@
-"""Record static poses of an arm for calibration. NumPy only; the arm need not be calibrated.
+"""Record an arm for calibration: poses at rest, and its motion between them. NumPy only; any arm.
 
-A ramp leads from one set of pressures to the next. Each set is held until the arm is at rest by calibration's
-rule (`mjx_softarm.logs.rest`). A pose is logged as the mean over the last second of its hold; with
-`transients`, each tick is logged. The columns are those of the control loop's log without references, goals
-and estimates.
+A step and a ramp lead from one set of pressures to the next; the step shows how fast the actuators follow.
+Each set is held until the arm is at rest by calibration's rule (`mjx_softarm.logs.rest`). Every tick is
+logged, in the columns of the control loop's log without references, goals and estimates.
+
+From time to time each tip of the second half is predicted from the springs, by a Gaussian process of what
+sections that bend evenly leave: from all other poses, and from the first half alone. Once all others predict
+no better, more poses bring nothing, and the recording ends.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,16 +21,28 @@ from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.belief import LOST_SHARE, STUCK_PRESSURE_KPA, stuck_springs
 from mjx_softarm.deploy.drive import Drive, ramp
 from mjx_softarm.deploy.ending import Ending, vent_at_end
-from mjx_softarm.deploy.link import ArmFault, Recorder, stacked
-from mjx_softarm.logs.checks import same_sign
+from mjx_softarm.deploy.link import ArmFault, Recorder
 from mjx_softarm.logs.rest import MIN_HOLD_S, NEEDED, ROUNDING_S, WINDOW_S, leaves, moves
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.body import holes_m, spring_directions
 from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
+from mjx_softarm.posture import base_rotation
+from mjx_softarm.sensing.estimator import Frame, even_pose
 from mjx_softarm.spec import ArmSpec
 
 TIMEOUT_S = SETTLE_TIMEOUT_S + MIN_HOLD_S + WINDOW_S
 PROGRESS_S = 10.0  # between lines of progress
 UNSEEN_POSES = 3  # poses in a row without a frame of motion capture after which it counts as gone; by hand
+# First step of the command towards a pose, in ranges of pressure: ten times a regulator's deadband, and too
+# small to swing the arm; by hand
+STEP_SHARE = 1 / 6
+MIN_POSES = 40  # least number of poses of a recording that ends by itself
+CHECK_POSES = 10  # poses between two checks whether more bring something; two in a row have to agree
+ENOUGH = 0.95  # ratio of the errors by all poses and by half of them from which more poses bring nothing
+LENGTHS = np.geomspace(
+    1.0, 30.0, 6
+)  # length scales of the process that are tried, in deviations of the springs
+NOISE = 0.05  # deviation of a tip's noise, in that of the process
 
 
 class PoseRecording(NamedTuple):
@@ -35,62 +50,106 @@ class PoseRecording(NamedTuple):
 
     log: Log
     n_poses: int  # number of poses at rest
-    n_unsettled: int  # number of poses not seen at rest within TIMEOUT_S; logged only with transients
+    n_unsettled: int  # number of poses not seen at rest within TIMEOUT_S
     ending: Ending
+    error_mm: float  # median error of tips that the other poses predict; NaN if unknown
 
 
 def record(
     arm: ArmIO,
     spec: ArmSpec,
     targets_kpa: np.ndarray,
-    transients: bool = False,
     tell: Callable[[str], None] = lambda text: None,
     save: Callable[[Log], None] = lambda log: None,
 ) -> PoseRecording:
-    """Drive an arm through pressures, log it, and vent; `vent_at_end` says what else ends a recording.
+    """Drive an arm through pressures, log every tick, and vent; `vent_at_end` has what else ends a recording.
 
     Args:
         arm: without pressure, as its driver gives it.
         spec: the arm, for its rate, its limits and the range of its sensors.
         targets_kpa (m, n_chambers) [kPa]: sets of pressures, in order.
-        transients: log every tick instead of the static poses.
         tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.
     """
     rows = Recorder()
     hold = _Hold()
     rest = []
+    poses = []  # spring lengths and tip [m] of each pose with both
+    error_mm, n_enough = np.nan, 0
 
     def on_tick(row: dict) -> None:
         hold.add(row, "tip_m" in row or not drive.link.sees)
-        if transients:
-            rows.add(row)
+        rows.add(row)
 
     drive = Drive(arm, spec, on_tick)
+    step_kpa = STEP_SHARE * (spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa)
     began_s = reported_s = time.monotonic()
 
     def run() -> None:
-        nonlocal reported_s
+        nonlocal reported_s, error_mm, n_enough
         for k, target_kpa in enumerate(targets_kpa, 1):
-            # Drive to the pressures, check the arm, log the pose.
+            # Drive to the pressures, and check the arm.
             hold.ticks.clear()
-            rest.append(drive.to_rest(ramp(target_kpa, drive.dt_s), hold.is_long, TIMEOUT_S) is not None)
+            law = ramp(target_kpa, drive.dt_s, step_kpa)
+            rest.append(drive.to_rest(law, hold.is_long, TIMEOUT_S) is not None)
             hold.check(drive, target_kpa if rest[-1] else None)
-            if rest[-1] and not transients:
-                rows.add(_mean(hold.last_second()))
+
+            # Predict each tip from the other poses; end where more poses bring nothing.
+            if rest[-1] and np.isfinite(pose := hold.pose(drive)).all():
+                poses.append(pose)
+            if len(poses) >= MIN_POSES and len(poses) % CHECK_POSES == 0:
+                half_mm, error_mm = prediction_errors_mm(np.array(poses), spec)
+                n_enough = n_enough + 1 if error_mm > ENOUGH * half_mm else 0
 
             # Report the progress.
             now_s = time.monotonic()
-            if now_s - reported_s >= PROGRESS_S or k == len(targets_kpa):
+            if n_enough > 1 or now_s - reported_s >= PROGRESS_S or k == len(targets_kpa):
                 left_min = (now_s - began_s) / k * (len(targets_kpa) - k) / 60
-                tell(f"{k} of {len(targets_kpa)} poses, about {left_min:.1f} min left")
+                known = (
+                    "" if np.isnan(error_mm) else f"; each is predicted from the others to {error_mm:.1f} mm"
+                )
+                tell(f"{k} of {len(targets_kpa)} poses, about {left_min:.1f} min left{known}")
                 reported_s = now_s
+            if n_enough > 1:
+                tell("half of them predict as well: more poses bring nothing")
+                return
 
     def log() -> Log:
         return rows.log("record", drive.sensor)
 
     ending = vent_at_end(run, drive.link, tell, lambda: save(log()) if len(rows) else None)
-    return PoseRecording(log(), sum(rest), len(rest) - sum(rest), ending)
+    return PoseRecording(log(), sum(rest), len(rest) - sum(rest), ending, error_mm)
+
+
+def prediction_errors_mm(poses: np.ndarray, spec: ArmSpec) -> tuple[float, float]:
+    """Return median errors [mm] of the second half's tips: predicted by the first half, and by all others.
+
+    Args:
+        poses (n, n_springs + 3) [m]: spring lengths and tips.
+        spec: the arm.
+
+    Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning" (2006), section 5.4.2.
+    """
+    # What even bending leaves, and similarity of the poses
+    spring_m, tip_m = poses[:, : spec.n_springs], poses[:, spec.n_springs :]
+    base = Frame(np.array(spec.mounting.base_offset_m), base_rotation(spec))
+    site_m = holes_m(spring_directions(spec), spec.per_section(spec.geometry.spring_radius_m))
+    left_mm = 1e3 * tip_m - even_pose(base, site_m, spring_m)[:, :3]
+    left_mm -= left_mm.mean(axis=0)
+    spring = (spring_m - spring_m.mean(axis=0)) / np.maximum(spring_m.std(axis=0), 1e-6)
+    square = np.sum((spring[:, None] - spring) ** 2, axis=-1)
+
+    # Errors of each length scale; the best one counts
+    n = len(poses) // 2
+    errors = []
+    for length in LENGTHS:
+        kernel = 1.0 + spring @ spring.T + np.exp(-0.5 * square / length**2) + NOISE**2 * np.eye(len(poses))
+        inverse = np.linalg.inv(kernel)
+        by_half = left_mm[n:] - kernel[n:, :n] @ np.linalg.solve(kernel[:n, :n], left_mm[:n])
+        by_others = (inverse @ left_mm)[n:] / inverse.diagonal()[n:, None]
+        errors.append([np.median(np.linalg.norm(error, axis=1)) for error in (by_half, by_others)])
+    by_half_mm, by_others_mm = np.min(errors, axis=0)
+    return float(by_half_mm), float(by_others_mm)
 
 
 class _Hold:
@@ -114,6 +173,13 @@ class _Hold:
         """Return the rows of the last second."""
         since_s = self.rows[-1]["time_s"] - WINDOW_S - ROUNDING_S
         return [row for row in self.rows if row["time_s"] >= since_s]
+
+    def pose(self, drive: Drive) -> np.ndarray:
+        """Return spring lengths and tip (n_springs + 3,) [m] at the end of a hold; NaN where unknown."""
+        rows = self.last_second()
+        readings = np.array([row["readings"] for row in rows])
+        tip_m = np.array([row.get("tip_m", np.full(3, np.nan)) for row in rows])
+        return np.append(drive.sensor.lengths(readings, np.nan).length_m.mean(axis=0), tip_m.mean(axis=0))
 
     def is_long(self) -> bool:
         """Return whether the hold has been long enough and the tip is at rest."""
@@ -153,16 +219,3 @@ class _Hold:
             got = kpa[-1, k[0]]
             wanted = target_kpa[k[0]]
             raise ArmFault(f"pressures: chamber{k[0]}: got {got:.1f} kPa at rest, expected {wanted:.1f} kPa")
-
-
-def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return the mean of rows at rest over their finite numbers; NaN where there is none."""
-    values = stacked(rows)
-    if "tip_quaternion" in values:
-        mean = same_sign(values["tip_quaternion"])[0].mean(axis=0)
-        values["tip_quaternion"] = mean[None] / np.linalg.norm(mean)
-    with np.errstate(invalid="ignore"):  # 0 / 0 is NaN
-        return {
-            name: np.where(np.isfinite(value), value, 0.0).sum(axis=0) / np.isfinite(value).sum(axis=0)
-            for name, value in values.items()
-        }

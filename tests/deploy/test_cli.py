@@ -150,7 +150,7 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
     (folder / "driver.py").write_text(
         "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n" + driver
     )
-    done = command(folder, "record", "--arm", "driver:Arm", "--out", "a.csv", "--poses", "9", "--transients")
+    done = command(folder, "record", "--arm", "driver:Arm", "--out", "a.csv", "--poses", "9")
     assert done.stdout.endswith(f"{status} []\n") and message in done.stderr
     written = np.loadtxt(folder / "written.txt")
     assert np.abs(written).max() > 3.0 and not written[-1].any()

@@ -1,8 +1,12 @@
-"""Actuators, fitted to commanded and measured pressures.
+"""Actuators, fitted to commanded and measured pressures, or to commands and springs.
 
 Pumps and regulators of `mjx_softarm.pneumatics` are driven with the logged commands. The volumes of their
 chambers follow the logged spring lengths; no other part of the arm's model takes part. Their pressures are
 compared with the measured ones.
+
+Without measured pressures they are compared with those by the springs (`calib.fit.motion.tracks`), through
+the lag of the arm itself. Two lags in a row may be exchanged without a change of the answer, so the arm's lag
+needs a prior: that of its shape, which springs and tip show without pressures.
 
 A regulator has numbers of all chambers, and a deviation of each chamber from them with a prior: a chamber
 whose command never changed has the numbers of the others. Each chamber has an offset.
@@ -14,19 +18,18 @@ import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import (
-    NOT_CONVERGED,
     Model,
     Problem,
     Solution,
     descend,
+    refine,
     rms_of,
-    solution_at,
 )
 from calib.fit.motion.tracks import Runs, Track
 from mjx_softarm.pneumatics import LONGEST_DELAY_S, PAPER_PUMP, Actuators, Pump, Regulator
@@ -37,18 +40,67 @@ BLOCK_S = 10  # clusters of a held-out block: a whole transient
 # Starts of the fit [s, s, ranges of the commands a second]; the best one is refined.
 LAGS_S, DEAD_TIMES_S, RATES = (0.05, 0.2, 0.5, 1.0), (0.02, 0.1, 0.25, 0.5), (1.5, 0.4)
 ALIKE = 1.02  # ratio of errors of starts that fit alike
+VOLUME_SHARES = (0.0, 1.0)  # starts, too
 DEADBAND_KPA = 0.1
 SHARED_PRIOR, CHAMBER_PRIOR = 1.0, 0.05  # standard deviations of logarithms
 OFFSET_PRIOR_KPA = 10.0
+VOLUME_PRIOR = 1.0  # standard deviation of the share of the volume's effect
+# Lag of the springs behind the pressures, over that of the shape behind the springs: some two thirds where
+# the backbone alone is damped, as of the paper's arm (0.34 to 0.42 of 0.60 s), one where all parts are damped
+# alike.
+OF_SHAPE, OF_SHAPE_PRIOR = 0.85, 0.3
+# Standard deviation of the logarithms of the lags of stretching and of each section's bending over that. On a
+# rod whose parts all creep with 0.25 s, stretching lags by 0.25 s in each section, and bending by 0.10, 0.15
+# and 0.20 s.
+MODE_PRIOR = 0.5
 DIFFERENCE = 0.01  # change of a logarithm, or of an offset [kPa], between two runs
-SCALE_KPA = 1.0  # standard deviation of a pressure, against which the priors weigh
+SCALE_KPA, LEAST_SCALE_KPA = 1.0, 0.1  # standard deviation of a mode: first guess, least value
+ROUNDS = 2  # fits, each with the scales of the one before
 NO_OUTLIERS = 1e9  # errors, in scales, from which the loss is linear
-TOLERANCES: dict[str, Any] = {"max_nfev": 40, "ftol": 1e-5, "xtol": 1e-3, "gtol": None}  # end of the fit
+TOLERANCES: dict[str, Any] = {"max_nfev": 60, "ftol": 1e-6, "xtol": 1e-3, "gtol": None}  # end of the fit
+# Standard deviation of the logarithms of lag and dead time by the springs, beside that of the fit: the arm is
+# more than some lags. Planted lags of 0.5 and 0.8 s of rods came out 1 % above and 4 % below.
+BY_SPRINGS = 0.05
+MISFIT, SMALL_MISFIT_KPA = (
+    4.0,
+    0.15,
+)  # error, in the noise of the pressures and at least, of another kind of actuator
+# Greatest distance of a converged fit from its minimum, in standard deviations; dead times are interpolated
+# between ticks, and the errors have kinks there
+SMALL_STEP = 0.5
 KNOWN = 0.3  # relative half-width of an interval up to which a number counts as known
 MARGIN, SMALL_KPA = 1.05, 0.1  # ratio and difference of errors up to which the simpler actuators are better
 MAX_RATIO = 2.0  # ratio of held-out to other errors from which there is a warning
 _SHARED = ("lag_s", "dead_time_s", "fill_kpa_per_s", "vent_kpa_per_s", "deadband_kpa")
 _OWN, _RATES = _SHARED[:4], _SHARED[2:4]  # numbers that differ between chambers; greatest rates
+
+
+class ArmLag(NamedTuple):
+    """Lag of the springs behind the pressures; a lag of zero for measured pressures."""
+
+    lag_s: float
+    log_std: float  # standard deviation of its logarithm
+
+    def of_modes(self, x: np.ndarray, n_chambers: int) -> np.ndarray:
+        """Return the lags (modes,) [s] of each section's mean and differences.
+
+        Args:
+            x (2 + n_sections,): logarithms over the lag: of all modes, of the means, of each section's
+                differences.
+            n_chambers: number of modes.
+        """
+        n_sections = len(x) - 2
+        lag_s = np.repeat(self.lag_s * np.exp(x[0] + x[2:]), n_chambers // n_sections)
+        lag_s[:: n_chambers // n_sections] = self.lag_s * np.exp(x[0] + x[1])
+        return lag_s
+
+    @classmethod
+    def of_shape(cls, lag_s: float, log_std: float) -> ArmLag:
+        """Return the lag as the shape's lag, and the standard deviation of its logarithm, let expect it."""
+        return cls(OF_SHAPE * lag_s, float(np.hypot(OF_SHAPE_PRIOR, log_std)))
+
+
+MEASURED = ArmLag(0.0, SHARED_PRIOR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,46 +113,58 @@ class ActuatorFit:
     in_sample_rms_kpa: float  # seconds of the fit
     held_out_rms_kpa: Mapping[str, float]  # held-out seconds: regulator, pump, the specification, the command
     chamber_rms_kpa: np.ndarray  # (c,) held-out seconds of each chamber
+    noise_kpa: float  # noise of the pressures, from row to row
     n_tracks: int
     time_s: float
+    arm_lag_s: float | None  # lag of the springs behind the pressures; None where these were measured
     warnings: tuple[str, ...] = ()  # reasons not to trust the fit, each with its remedy
     notes: tuple[str, ...] = ()  # numbers that the logs do not show
 
 
-def fit_actuators(tracks: Sequence[Track], spec: ArmSpec, seed: int = 0) -> ActuatorFit:
+def fit_actuators(
+    tracks: Sequence[Track], spec: ArmSpec, seed: int = 0, arm: ArmLag | None = None
+) -> ActuatorFit:
     """Fit regulators, and the flow of pumps; keep those that are better on held-out seconds.
 
     Args:
         tracks: parts of logs from `find_tracks`, one or more.
         spec: arm, its chambers already calibrated.
         seed: seed that chooses the held-out seconds.
+        arm: lag that the arm is expected to have, of tracks with pressures by the springs; None for measured
+            ones.
     """
-    runs = Runs(tracks, 1.0 / spec.control.rate_hz)
-    held_out = np.repeat(held_out_blocks(runs.n_seconds, BLOCK_S, seed), spec.n_chambers)
+    by_springs, arm, c = arm is not None, arm or MEASURED, spec.n_chambers
+    n_sections = spec.structure.n_sections
+    runs = Runs(tracks, 1.0 / spec.control.rate_hz, n_sections if by_springs else None)
+    held_out = np.repeat(held_out_blocks(runs.n_seconds, BLOCK_S, seed), c)
 
     # Fit both kinds; judge them, the specification and the command by the held-out seconds
-    regulator, solution = fit_regulator(runs, ~held_out)
-    pump = _fit_pump(runs, ~held_out, spec)
-    kinds = {"regulator": regulator, "pump": pump, "specification": spec.actuators}
-    errors = {name: runs.errors(actuators.per_chamber(spec.n_chambers)) for name, actuators in kinds.items()}
-    errors["command"] = runs.clusters([t.commanded_kpa - t.pressure_kpa for t in tracks])
+    regulator, lag_s, solution = fit_regulator(runs, ~held_out, arm, n_sections)
+    kinds = {"regulator": (regulator, lag_s), "pump": _fit_pump(runs, ~held_out, spec, arm)}
+    kinds["specification"] = spec.actuators, arm.of_modes(np.zeros(2 + n_sections), c)
+    errors = {
+        name: runs.errors(runs.simulated([actuators.per_chamber(c)]), own_s)[0]
+        for name, (actuators, own_s) in kinds.items()
+    }
+    errors["command"] = runs.errors([track.commanded_kpa[:, None] for track in tracks], np.zeros(c))[0]
     rms = {name: rms_of(error[held_out]) for name, error in errors.items()}
     bound = {name: max(MARGIN * value, value + SMALL_KPA) for name, value in rms.items()}
     simpler = "specification" if rms["specification"] <= bound["pump"] else "pump"
     chosen = simpler if rms[simpler] <= bound["regulator"] else "regulator"
 
     # Put the better kind into the specification
-    own = held_out.reshape(-1, spec.n_chambers)
-    error = errors[chosen].reshape(*own.shape, -1)
+    of_chambers = np.einsum("smr,mc->csr", errors[chosen][held_out].reshape(-1, c, runs.rows), runs.modes)
     done = ActuatorFit(
-        spec=with_actuators(spec, kinds[chosen]),
+        spec=with_actuators(spec, kinds[chosen][0]),
         chosen=chosen,
-        half_width_95=_half_widths(regulator, solution),
+        half_width_95=_half_widths(regulator, solution, BY_SPRINGS if by_springs else 0.0),
         in_sample_rms_kpa=rms_of(errors[chosen][~held_out]),
         held_out_rms_kpa=rms,
-        chamber_rms_kpa=np.array([rms_of(error[own[:, k], k]) for k in range(spec.n_chambers)]),
+        chamber_rms_kpa=np.array([rms_of(error) for error in of_chambers]),
+        noise_kpa=runs.noise_kpa(),
         n_tracks=len(tracks),
         time_s=sum(len(track.pressure_kpa) for track in tracks) / spec.control.rate_hz,
+        arm_lag_s=float(np.mean(kinds[chosen][1])) if by_springs else None,
     )
     return dataclasses.replace(done, warnings=_warnings(done, solution), notes=_notes(done))
 
@@ -120,66 +184,105 @@ def with_actuators(spec: ArmSpec, actuators: Actuators) -> ArmSpec:
     return spec.replace(control={"ki_kpa_per_ms": min(spec.control.ki_kpa_per_ms, slowest)})
 
 
-def fit_regulator(runs: Runs, used: np.ndarray) -> tuple[Regulator, Solution]:
-    """Fit regulators to the clusters `used` (n,) bool; return them and the solution.
+def fit_regulator(
+    runs: Runs, used: np.ndarray, arm: ArmLag, n_sections: int
+) -> tuple[Regulator, np.ndarray, Solution]:
+    """Fit regulators to the clusters `used` (n,) bool; return them, the arm's lags (modes,) [s], the fit.
 
-    Parameters are the logarithms of `_SHARED` over the start, offsets (c,) [kPa], and the logarithms of the
-    chambers' deviations, `_OWN` by c.
+    Parameters are the logarithms of `_SHARED` over the start, the change of the volume's share, offsets (c,)
+    [kPa], the logarithms of the chambers' deviations, `_OWN` by c, and those of the arm's lags (2 +
+    n_sections,).
     """
-    c = runs.n_chambers
-    start = _start(runs, used)
+    c, n_shared, n_lags = runs.n_chambers, len(_SHARED) + 1, 2 + n_sections
+    start = _start(runs, used, arm, n_sections)
+    parts = np.cumsum([n_shared, c, len(_OWN) * c])
 
-    def regulator(x: np.ndarray) -> Regulator:
-        shared, offset, own = x[: len(_SHARED)], x[len(_SHARED) :][:c], x[len(_SHARED) + c :].reshape(-1, c)
-        own = np.concatenate([own, np.zeros((len(_SHARED) - len(own), c))])
-        values = {name: start[name] * np.exp(shared[k] + own[k]) for k, name in enumerate(_SHARED)}
+    def numbers(x: np.ndarray) -> tuple[Regulator, np.ndarray]:
+        shared, offset, own, lags = np.split(x, parts)
+        own = np.concatenate([own.reshape(-1, c), np.zeros((len(_SHARED) - len(_OWN), c))])
+        values = {name: getattr(start, name) * np.exp(shared[k] + own[k]) for k, name in enumerate(_SHARED)}
         values["dead_time_s"] = np.minimum(values["dead_time_s"], LONGEST_DELAY_S)
-        return Regulator(**values, offset_kpa=offset)
+        # On the way to the best share, one a little beyond the bounds keeps a slope
+        found = Regulator(**values, offset_kpa=offset, volume_share=start.volume_share + shared[-1])
+        return found, arm.of_modes(lags, c)
 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # A change of a shared number changes all chambers, one of a chamber that chamber alone
-        steps = np.eye(len(_SHARED) + 1) * DIFFERENCE
-        ahead = [np.r_[step[:-1], np.full(c, step[-1]), np.zeros(len(_OWN) * c)] for step in steps]
-        here, *others = runs.errors_of([regulator(x + step) for step in (np.zeros_like(x), *ahead)])
-        slope = np.stack([(other - here) / DIFFERENCE for other in others], axis=-1)  # (n, m, shared + 1)
-        mask = np.eye(c)[np.arange(len(here)) % c][:, None]  # (n, 1, c): a cluster belongs to a chamber
-        columns = [slope[..., :-1], slope[..., -1:] * mask]
-        columns += [slope[..., k : k + 1] * mask for k in range(len(_OWN))]
-        return here[used], np.concatenate(columns, axis=-1)[used]
+        # Changes of the pressures by shared numbers, and by the offset, of all chambers
+        rest = np.zeros(len(_OWN) * c + n_lags)
+        steps = DIFFERENCE * np.eye(n_shared + 1)
+        ahead = [x + np.r_[step[:-1], np.full(c, step[-1]), rest] for step in steps]
+        lag_s = numbers(x)[1]
+        kpa = runs.simulated([numbers(tried)[0] for tried in (x, *ahead)])
+        change = [(run[:, 1:] - run[:, :1]) / DIFFERENCE for run in kpa]  # (n, shared + 1, c)
+        # A number of a chamber changes that chamber's pressure alone
+        own = [np.concatenate([one[:, -1:], one[:, : len(_OWN)]], axis=1) for one in change]
+        own = [(one[:, :, None] * np.eye(c)).reshape(len(one), -1, c) for one in own]
+        moved = [np.concatenate([a[:, :-1], b], axis=1) for a, b in zip(change, own, strict=True)]
+        columns = [*runs.clusters(runs.followed(moved, lag_s))]
+        # Changes by the arm's lags
+        here_kpa = [run[:, :1] for run in kpa]
+        here = runs.errors(here_kpa, lag_s)[0]
+        for step in DIFFERENCE * np.eye(n_lags):
+            later_s = numbers(x + np.r_[np.zeros(len(x) - n_lags), step])[1]
+            columns.append((runs.errors(here_kpa, later_s)[0] - here) / DIFFERENCE)
+        return here[used], np.stack(columns, axis=-1)[used]
 
-    priors = [SHARED_PRIOR] * len(_SHARED) + [OFFSET_PRIOR_KPA] * c + [CHAMBER_PRIOR] * len(_OWN) * c
-    solution = _fit(model, np.array(priors), runs.rows)
-    return regulator(solution.x), solution
+    priors = [SHARED_PRIOR] * len(_SHARED) + [VOLUME_PRIOR] + [OFFSET_PRIOR_KPA] * c
+    priors += [CHAMBER_PRIOR] * len(_OWN) * c + [arm.log_std] + [MODE_PRIOR] * (n_lags - 1)
+    solution = _fit(model, np.array(priors), runs, used)
+    found, lag_s = numbers(solution.x)
+    share = float(np.clip(found.volume_share, 0.0, 1.0))
+    return dataclasses.replace(found, volume_share=share), lag_s, solution
 
 
-def _fit_pump(runs: Runs, used: np.ndarray, spec: ArmSpec) -> Pump:
-    """Fit the flow of pumps whose valves are those of the specification, or of the paper."""
+def _fit_pump(runs: Runs, used: np.ndarray, spec: ArmSpec, arm: ArmLag) -> tuple[Pump, np.ndarray]:
+    """Fit the flow of pumps, whose valves stay; return them and the arm's lags (modes,) [s]."""
     own = spec.actuators if isinstance(spec.actuators, Pump) else PAPER_PUMP
+    n = 3 + spec.structure.n_sections
 
-    def pump(x: np.ndarray) -> Pump:
-        return dataclasses.replace(own, flow_l_per_min=float(own.flow_l_per_min * np.exp(x[0])))
+    def numbers(x: np.ndarray) -> tuple[Pump, np.ndarray]:
+        flow = float(own.flow_l_per_min * np.exp(x[0]))
+        return dataclasses.replace(own, flow_l_per_min=flow), arm.of_modes(x[1:], spec.n_chambers)
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        pump, lag_s = numbers(x)
+        return runs.errors(runs.simulated([pump]), lag_s)[0][used]
 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        here, ahead = (runs.errors(pump(x + step)) for step in (0.0, DIFFERENCE))
-        return here[used], ((ahead - here) / DIFFERENCE)[used, :, None]
+        here = errors(x)
+        ahead = [(errors(x + step) - here) / DIFFERENCE for step in DIFFERENCE * np.eye(n)]
+        return here, np.stack(ahead, axis=-1)
 
-    return pump(_fit(model, np.array([SHARED_PRIOR]), runs.rows).x)
+    priors = [SHARED_PRIOR, arm.log_std] + [MODE_PRIOR] * (n - 2)
+    return numbers(_fit(model, np.array(priors), runs, used).x)
 
 
-def _fit(model: Model, prior: np.ndarray, rows: int) -> Solution:
+def _fit(model: Model, prior: np.ndarray, runs: Runs, used: np.ndarray) -> Solution:
     """Minimise the squared errors (n, rows) of a model from x = 0.
 
     Rows at rest are many and exact; a robust loss would take the transients among them for outliers. The rows
-    of a cluster are not independent: together they weigh as one.
+    of a cluster are not independent: together they weigh as one. After a first fit each mode has the scale of
+    its errors.
     """
-    scale = np.array([SCALE_KPA * rows**0.5])
-    problem = Problem(prior, np.zeros(rows, int), scale, min_scale=scale, huber=NO_OUTLIERS)
-    x = descend(model, np.zeros(len(prior)), scale, problem, "linear", TOLERANCES)
-    return solution_at(x, *model(x), problem)
+    mode = np.flatnonzero(used) % runs.n_chambers  # of each cluster
+
+    def problem(scale_kpa: np.ndarray) -> Problem:
+        scale = runs.rows**0.5 * scale_kpa
+        group = np.repeat(mode[:, None], runs.rows, axis=1)
+        return Problem(prior, group, scale, min_scale=scale, huber=NO_OUTLIERS)
+
+    x, scale_kpa = np.zeros(len(prior)), np.full(runs.n_chambers, SCALE_KPA)
+    for _ in range(ROUNDS):
+        now = problem(scale_kpa)
+        x = descend(model, x, now.scale, now, "linear", TOLERANCES)
+        error = model(x)[0]
+        rms_kpa = [rms_of(error[mode == k]) for k in range(runs.n_chambers)]
+        scale_kpa = np.maximum(rms_kpa, LEAST_SCALE_KPA)
+    return refine(model, x, problem(scale_kpa))
 
 
-def _start(runs: Runs, used: np.ndarray) -> dict[str, np.ndarray]:
-    """Return numbers (c,) of regulators, alike for all chambers: the best of a grid.
+def _start(runs: Runs, used: np.ndarray, arm: ArmLag, n_sections: int) -> Regulator:
+    """Return regulators with numbers (c,), alike for all chambers: the best of a grid.
 
     Of rates that fit alike the greatest are taken: commands that changed slowly do not show a limit.
     """
@@ -191,8 +294,13 @@ def _start(runs: Runs, used: np.ndarray) -> dict[str, np.ndarray]:
         for fill, vent in itertools.product(range_kpa * np.array(RATES), repeat=2)
     ]
     grid = [{**numbers, "deadband_kpa": DEADBAND_KPA} for numbers in grid]
-    starts = [{name: np.full(c, value) for name, value in numbers.items()} for numbers in grid]
-    errors = runs.errors_of([Regulator(**numbers, offset_kpa=offset) for numbers in starts])
+    each = [{name: np.full(c, value) for name, value in numbers.items()} for numbers in grid]
+    starts = [
+        Regulator(**numbers, offset_kpa=offset, volume_share=share)
+        for share in VOLUME_SHARES
+        for numbers in each
+    ]
+    errors = runs.errors(runs.simulated(starts), arm.of_modes(np.zeros(2 + n_sections), c))
     rms = np.array([rms_of(error[used]) for error in errors])
     return starts[int(np.argmax(rms <= ALIKE * rms.min()))]
 
@@ -203,29 +311,42 @@ def _plain(actuators: Actuators) -> dict[str, float | tuple[float, ...]]:
     return {name: tuple(map(float, x)) if np.ndim(x) else float(x) for name, x in values.items()}
 
 
-def _half_widths(regulator: Regulator, solution: Solution) -> dict[str, np.ndarray]:
-    """Return the half-widths (c,) of the numbers of a regulator, of shared and own parameters together."""
-    c, n = np.size(regulator.offset_kpa), len(_SHARED)
+def _half_widths(regulator: Regulator, solution: Solution, log_std: float) -> dict[str, np.ndarray]:
+    """Return the half-widths (c,) of the numbers of a regulator, of shared and own parameters together.
+
+    `log_std` is a further standard deviation of the logarithms of lag and dead time.
+    """
+    c, n = np.size(regulator.offset_kpa), len(_SHARED) + 1
     covariance = solution.covariance
     widths = {}
     for k, name in enumerate(_SHARED):
-        variance = np.full(c, covariance[k, k])
+        variance = np.full(c, covariance[k, k]) + (log_std**2 if name in _OWN[:2] else 0.0)
         if name in _OWN:
             own = n + c + k * c + np.arange(c)
             variance = variance + covariance[own, own] + 2 * covariance[k, own]
         widths[name] = QUANTILE * np.sqrt(np.maximum(variance, 0.0)) * getattr(regulator, name)
     offset = n + np.arange(c)
-    return widths | {"offset_kpa": QUANTILE * np.sqrt(covariance[offset, offset])}
+    share = QUANTILE * np.sqrt(covariance[len(_SHARED), len(_SHARED)])
+    return widths | {
+        "offset_kpa": QUANTILE * np.sqrt(covariance[offset, offset]),
+        "volume_share": np.full(c, share),
+    }
 
 
 def _warnings(done: ActuatorFit, solution: Solution) -> tuple[str, ...]:
-    said = [] if solution.converged else [NOT_CONVERGED]
+    said = [] if solution.decrement < 0.5 * SMALL_STEP**2 else ["the fit did not converge: log for longer"]
     said += [
         f"{name} is known to {100 * share:.0f} % only: log larger steps of the commands"
         for name, share in _uncertain(done).items()
         if name not in _RATES
     ]
     held_out = done.held_out_rms_kpa[done.chosen]
+    if done.arm_lag_s is None and held_out > max(MISFIT * done.noise_kpa, SMALL_MISFIT_KPA):
+        said.append(
+            f"the best model of the actuators is {held_out:.2f} kPa off, where the noise of the pressures is "
+            f"{done.noise_kpa:.2f} kPa: yours are of another kind, and the intervals may not hold. Expect "
+            "larger errors behind a goal that moves (`deploy measure --seconds`), not at stops"
+        )
     if held_out > MAX_RATIO * done.in_sample_rms_kpa:
         said.append(
             f"held-out error {held_out:.2f} kPa is more than {MAX_RATIO:g} times the error of the other "

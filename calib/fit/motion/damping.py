@@ -1,7 +1,8 @@
 """Damping of chambers and backbone, fitted to the tip's motion after the pressures changed.
 
-C MuJoCo is driven with the logged pressures along a stretch of the log, and its tip is compared with the
-measured tip. The first seconds do not count: the arm's motion at the beginning is unknown, and decays.
+C MuJoCo is driven with the logged pressures along a stretch of the log, or with those that the calibrated
+actuators make of the commands where no pressures were measured. Its tip is compared with the measured tip.
+The first seconds do not count: the arm's motion at the beginning is unknown, and decays.
 
 The damping of the springs and the axial damping of the backbone stay as specified. They act in parallel with
 the chambers, which absorb their error.
@@ -20,7 +21,7 @@ import numpy as np
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
-from calib.fit.motion.tracks import clusters, dense_parts
+from calib.fit.motion.tracks import clusters, dense_parts, driven_kpa, spring_lengths_m
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import PerSection, scaled
 from mjx_softarm.logs.rest import HOLD_KPA
@@ -129,8 +130,9 @@ def fit_damping(
 def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
     """Return densely sampled parts of logs in which pressures change, resampled at the control rate.
 
-    Pressures are held from row to row, positions interpolated. Stretches come in the order of the logs, until
-    they last `MAX_TOTAL_S` together.
+    Pressures are held from row to row, positions interpolated. Stretches come in the order of the logs, from
+    the end of a part that is too long, until they last `MAX_TOTAL_S` together: a recording begins with small
+    motions.
     """
     found, left = [], _rows(MAX_TOTAL_S, spec)
     shortest = _rows(SETTLING_S + MIN_COUNTED_S, spec)
@@ -138,13 +140,20 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
         if log.pressure_kpa is None or log.tip_m is None or len(log) < 2:
             continue
         payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
+        spring_m = spring_lengths_m(log, spec)
         # Cut the log at gaps, and where the payload changes.
         for rows, times_s, newest in dense_parts(log, 1.0 / spec.control.rate_hz, np.diff(payload) != 0):
             # Resample the part, if it is long enough and its pressures change after the first seconds.
-            grid, time_s = times_s[:left], log.time_s[rows]
-            if len(grid) < shortest:
+            grid, newest, time_s = times_s[-left:], newest[-left:], log.time_s[rows]
+            if left == 0 or len(grid) < shortest:
                 continue
-            pressure = log.pressure_kpa[rows[newest[:left]]]
+            pressure = log.pressure_kpa[rows[newest]]
+            if log.commanded_kpa is None:
+                next_row = rows[
+                    np.minimum(newest + 1, len(rows) - 1)
+                ]  # has the command that was in force before it
+                length_m = None if spring_m is None else spring_m[rows[newest]]
+                pressure = driven_kpa(log.pressure_kpa[next_row], length_m, spec)
             if (np.ptp(pressure[_rows(SETTLING_S, spec) :], axis=0) <= HOLD_KPA).all():
                 continue
             tip = np.stack([np.interp(grid, time_s, log.tip_m[rows, k]) for k in range(3)], axis=1)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.fit.motion.tracks import dense_parts
+from calib.fit.motion.tracks import dense_parts, spring_lengths_m
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.fields import scaled
 from mjx_softarm.logs.schema import Log
@@ -31,6 +31,7 @@ from mjx_softarm.sensing.load import QUANTILE
 from mjx_softarm.spec import ArmSpec
 
 MIN_S = 10.0  # length of a part of a log
+MAX_TOTAL_S = 300.0  # length of all parts together
 SKIPPED_S = 3.0  # start of a part, before which the arm's motion is unknown
 EVERY_S = 0.1  # time between rows that are simulated
 LAGS_S = np.geomspace(0.02, 3.0, 41)
@@ -74,7 +75,11 @@ def fit_shape(logs: Sequence[Log], spec: ArmSpec) -> ShapeFit | None:
         logs: of the arm; those without springs, tip or dense rows are left out.
         spec: arm, its sensors and chambers already calibrated.
     """
-    parts = [part for log in logs for part in _parts(log, spec)]
+    parts, left = [], round(MAX_TOTAL_S / EVERY_S)
+    for log in logs:
+        for part in _parts(log, spec, left):
+            parts.append(part)
+            left -= len(part[0])
     if not parts or not spec.shape_lag_s:
         return None
 
@@ -110,12 +115,10 @@ def _log_std(cost: np.ndarray) -> float:
 Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def _parts(log: Log, spec: ArmSpec) -> list[Part]:
-    """Return the parts of a log without gaps of time or lengths, one row each `EVERY_S`."""
+def _parts(log: Log, spec: ArmSpec, left: int) -> list[Part]:
+    """Return the parts of a log without gaps of time or lengths, a row each `EVERY_S`: the last `left`."""
     # Spring lengths, and the mounting
-    readings, spring_m, tip_m = log.readings_of(spec.sensor), log.spring_m, log.tip_m
-    if readings is not None:
-        spring_m = spec.spring_sensor.lengths(readings, np.nan).length_m
+    spring_m, tip_m = spring_lengths_m(log, spec), log.tip_m
     if tip_m is None or spring_m is None:
         return []
     params = ArmParams.from_spec(spec)
@@ -124,15 +127,19 @@ def _parts(log: Log, spec: ArmSpec) -> list[Part]:
     # Rows at regular times of each part without a gap of times or lengths: a row less would shorten the lag
     found, known = [], np.asarray(np.isfinite(spring_m).all(axis=1))
     for part, _, newest in dense_parts(log, EVERY_S, known[1:] != known[:-1]):
-        rows = part[newest]
+        rows = part[newest][-left:]
+        if left <= 0:
+            break
         seen = np.asarray(np.isfinite(tip_m[rows]).all(axis=1))
         if not known[part[0]] or np.count_nonzero(seen) * EVERY_S < MIN_S:
             continue
         length_m, at_rest = spring_m[rows], simulate_poses(spec, spring_m[rows])
-        if at_rest.valid.all():
-            even_mm = even_pose(base, np.asarray(params.spring_site_m), length_m)[:, :3]
-            tip_mm = np.where(seen[:, None], 1e3 * tip_m[rows], np.nan)
-            found.append((length_m, tip_mm - even_mm, at_rest.pose[:, :3] - even_mm))
+        even_mm = even_pose(base, np.asarray(params.spring_site_m), length_m)[:, :3]
+        # A row at which the simulated arm finds no rest has no error, and the rest of the row before it
+        tip_mm = np.where((seen & at_rest.valid)[:, None], 1e3 * tip_m[rows], np.nan)
+        newest_valid = np.maximum.accumulate(np.where(at_rest.valid, np.arange(len(rows)), 0))
+        found.append((length_m, tip_mm - even_mm, (at_rest.pose[:, :3] - even_mm)[newest_valid]))
+        left -= len(rows)
     return found
 
 

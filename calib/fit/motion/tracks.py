@@ -1,13 +1,27 @@
-"""Parts of logs of the moving arm; tracks of pressures in them, and simulations of actuators along these."""
+"""Parts of logs of the moving arm; tracks of pressures in them, and simulations of actuators along these.
+
+Where a log has no measured pressures, the springs are the gauge: the calibrated arm at rest with these
+    lengths
+would need the pressures y. In motion these lag behind the true ones p, as damping holds the arm back. Each
+mode of a section, its mean pressure and the differences between its chambers, has a time constant T of its
+own:
+
+    T y' = p - y.
+
+The mean stretches the section. The differences bend it, against the weight below as well, which shortens T.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import helmert
+from scipy.signal import lfilter
 
+from calib.fit.leastsquares import SIGMA_PER_MEDIAN
 from mjx_softarm import pneumatics
 from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.logs.rest import HOLD_KPA
@@ -17,7 +31,7 @@ from mjx_softarm.spec import ArmSpec
 
 MAX_STEP_S = 0.05  # largest time between rows of a part
 MIN_TRACK_S = 5.0  # length of a track
-MAX_TOTAL_S = 300.0  # length of all tracks together
+MAX_TOTAL_S = 150.0  # length of all tracks together
 CLUSTER_S = 1.0  # errors within this time are not independent
 
 
@@ -43,6 +57,21 @@ def dense_parts(
         yield rows, grid, np.searchsorted(time_s, grid + 1e-6, side="right") - 1
 
 
+def driven_kpa(commanded_kpa: np.ndarray, spring_m: np.ndarray | None, spec: ArmSpec) -> np.ndarray:
+    """Return the pressures (n, c) [kPa] that an arm's actuators make of commands.
+
+    Args:
+        commanded_kpa (n, c) [kPa]: commands of each control period.
+        spring_m (n, n_springs) [m]: spring lengths, for the volumes; None where they are not known.
+        spec: arm with the actuators.
+    """
+    actuators = spec.actuators.per_chamber(spec.n_chambers)
+    offset_kpa = 0.0 if actuators.rest_offset_kpa is None else actuators.rest_offset_kpa
+    track = Track(commanded_kpa, commanded_kpa + offset_kpa, volumes_m3(spring_m, len(commanded_kpa), spec))
+    runs = Runs([track], 1.0 / spec.control.rate_hz)
+    return runs.simulated([actuators])[0][:, 0]
+
+
 def clusters(errors: np.ndarray, size: int) -> np.ndarray:
     """Cut errors (n, k) into clusters (m, size, k) of neighbouring rows; the last is NaN-padded."""
     padded = np.pad(errors, ((0, -len(errors) % size), (0, 0)), constant_values=np.nan)
@@ -53,74 +82,121 @@ class Track(NamedTuple):
     """Part of a log without gaps, resampled at the control rate."""
 
     commanded_kpa: np.ndarray  # (n, c) commands in force until the next row
-    pressure_kpa: np.ndarray  # (n, c) measured
+    pressure_kpa: np.ndarray  # (n, c) measured, or by the springs
     volume_m3: np.ndarray  # (n, c)
 
 
-def find_tracks(logs: Sequence[Log], spec: ArmSpec) -> list[Track]:
-    """Return densely sampled parts of logs with commanded and measured pressures in which commands change.
+def find_tracks(
+    logs: Sequence[Log], spec: ArmSpec, resting_kpa: Callable[[np.ndarray], np.ndarray] | None = None
+) -> list[Track]:
+    """Return densely sampled parts of logs in which commands change, with the pressures that followed.
 
     Tracks come in the order of the logs, until they last `MAX_TOTAL_S` together. Volumes are those at the
     section's length where a log has no lengths.
+
+    Args:
+        logs: of the arm.
+        spec: arm, its sensors already calibrated.
+        resting_kpa: pressures (n, c) of the arm at rest with spring lengths (n, n_springs) [m]; takes logs
+            without measured pressures. None takes the logs with measured ones.
     """
     found, left, period_s = [], round(MAX_TOTAL_S * spec.control.rate_hz), 1.0 / spec.control.rate_hz
     for log in logs:
-        if log.commanded_kpa is None or log.pressure_kpa is None or len(log) < 2:
+        # What was commanded, and what followed: measured pressures or springs
+        spring_m: Any = spring_lengths_m(log, spec)
+        commanded_kpa, followed = log.commanded_kpa, log.pressure_kpa
+        if resting_kpa is not None:
+            commanded_kpa, followed = (log.pressure_kpa if log.commanded_kpa is None else None), spring_m
+        if commanded_kpa is None or followed is None or len(log) < 2:
             continue
-        volume_m3 = _volumes(log, spec)
+        volume_m3 = volumes_m3(spring_m, len(log), spec)
         for rows, times_s, newest in dense_parts(log, period_s):
             grid, time_s = times_s[:left], log.time_s[rows]
-            changes = (np.ptp(log.commanded_kpa[rows], axis=0) > HOLD_KPA).any()
+            changes = (np.ptp(commanded_kpa[rows], axis=0) > HOLD_KPA).any()
             if len(grid) < MIN_TRACK_S * spec.control.rate_hz or not changes:
                 continue
             # A row has the command that was in force before it
             next_row = rows[np.minimum(newest[:left] + 1, len(rows) - 1)]
-            measured, volume = (
-                np.stack([np.interp(grid, time_s, column) for column in values[rows].T], axis=1)
-                for values in (log.pressure_kpa, volume_m3)
+            on_grid, volume = (
+                np.stack([_interpolated(grid, time_s, column) for column in values[rows].T], axis=1)
+                for values in (followed, volume_m3)
             )
-            found.append(Track(log.commanded_kpa[next_row], measured, volume))
+            pressure_kpa = on_grid if resting_kpa is None else resting_kpa(on_grid)
+            found.append(Track(commanded_kpa[next_row], pressure_kpa, volume))
             left -= len(grid)
     return found
+
+
+def _interpolated(grid: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (n,) at regular times (k,), over gaps where they are NaN."""
+    known = np.isfinite(values)
+    return np.interp(grid, time_s[known], values[known]) if known.any() else np.full(len(grid), np.nan)
 
 
 class Runs:
     """Simulations of tracks, many actuators at once.
 
-    Errors are arrays (clusters, rows) [kPa]: a cluster is a second of a chamber, NaN-padded. The chambers of
-    a second follow each other.
+    Errors are arrays (..., clusters, rows) [kPa]: a cluster is a second of a mode of the pressures,
+        NaN-padded. The
+    modes of a second follow each other.
+
+    Args:
+        tracks: what to follow.
+        period_s: control period.
+        n_sections: of tracks by the springs, whose modes are those of sections; None for measured pressures,
+            where each chamber is a mode.
     """
 
-    def __init__(self, tracks: Sequence[Track], period_s: float):
+    def __init__(self, tracks: Sequence[Track], period_s: float, n_sections: int | None = None):
         self.tracks, self._period_s = tracks, period_s
         self.n_chambers = tracks[0].pressure_kpa.shape[1]
         self.rows = max(round(CLUSTER_S / period_s), 1)
         self.n_seconds = sum(-(-len(track.pressure_kpa) // self.rows) for track in tracks)
+        modes = np.eye(self.n_chambers)
+        if n_sections is not None:
+            modes = np.kron(np.eye(n_sections), helmert(self.n_chambers // n_sections, full=True))
+        self.modes = modes  # (modes, c), orthonormal; the mean of a section comes first
 
-    def errors(self, actuators: Actuators) -> np.ndarray:
-        """Return simulated less measured pressures (clusters, rows)."""
-        return self.errors_of([actuators])[0]
+    def errors(self, kpa: Sequence[np.ndarray], lag_s: np.ndarray) -> np.ndarray:
+        """Return errors (b, clusters, rows) of pressures (n, b, c) of each track, with lags (modes,) [s]."""
+        followed = self.followed(kpa, lag_s)
+        measured = (track.pressure_kpa @ self.modes.T for track in self.tracks)
+        return self.clusters([run - y[:, None] for run, y in zip(followed, measured, strict=True)])
 
-    def errors_of(self, actuators: Sequence[Actuators]) -> list[np.ndarray]:
-        """Return simulated less measured pressures (clusters, rows) of actuators of one kind."""
+    def followed(self, kpa: Sequence[np.ndarray], lag_s: np.ndarray) -> list[np.ndarray]:
+        """Return the modes (n, b, modes) of pressures (n, b, c), behind these by lags (modes,) [s]."""
+        runs = [run @ self.modes.T for run in kpa]
+        for k in np.flatnonzero(lag_s):
+            kept = np.exp(-self._period_s / lag_s[k])
+            for run in runs:
+                start = run[:1, :, k]
+                run[..., k], _ = lfilter([0.0, 1.0 - kept], [1.0, -kept], run[..., k], axis=0, zi=start)
+        return runs
+
+    def simulated(self, actuators: Sequence[Actuators]) -> list[np.ndarray]:
+        """Return the pressures (n, b, c) [kPa] of each track with b actuators of one kind."""
         delay_s = np.array([np.full(self.n_chambers, one.delay_s) for one in actuators])  # (b, c)
         offsets = [0.0 if one.rest_offset_kpa is None else one.rest_offset_kpa for one in actuators]
         offset_kpa = np.array([np.full(self.n_chambers, offset) for offset in offsets])
         together = _stacked(actuators)
-        runs = [self._run(track, together, delay_s, offset_kpa) for track in self.tracks]
-        return [
-            self.clusters([run[:, b] - t.pressure_kpa for run, t in zip(runs, self.tracks, strict=True)])
-            for b in range(len(actuators))
-        ]
+        return [self._run(track, together, delay_s, offset_kpa) for track in self.tracks]
 
     def clusters(self, errors: Sequence[np.ndarray]) -> np.ndarray:
-        """Cut errors (n, c) of the tracks into clusters."""
-        seconds = np.concatenate([clusters(error, self.rows) for error in errors])
-        return np.swapaxes(seconds, 1, 2).reshape(-1, self.rows)
+        """Cut errors (n, b, modes) of the tracks into clusters (b, clusters, rows)."""
+        seconds = np.concatenate(
+            [clusters(error.reshape(len(error), -1), self.rows) for error in errors]
+        )  # (s, rows, b modes)
+        seconds = seconds.reshape(*seconds.shape[:2], -1, self.n_chambers)
+        return np.transpose(seconds, (2, 0, 3, 1)).reshape(seconds.shape[2], -1, self.rows)
 
     def rest_offset_kpa(self) -> np.ndarray:
         """Return the median of measured less commanded pressures (c,)."""
         return np.median(np.concatenate([t.pressure_kpa - t.commanded_kpa for t in self.tracks]), axis=0)
+
+    def noise_kpa(self) -> float:
+        """Return the robust standard deviation of the pressures' noise, from second differences of rows."""
+        change = np.concatenate([np.diff(track.pressure_kpa, 2, axis=0) for track in self.tracks])
+        return float(SIGMA_PER_MEDIAN * np.median(np.abs(change)) / 6**0.5)
 
     def _run(
         self, track: Track, actuators: Actuators, delay_s: np.ndarray, offset_kpa: np.ndarray
@@ -129,19 +205,20 @@ class Runs:
         first_kpa = np.broadcast_to(track.pressure_kpa[0], delay_s.shape)
         command_kpa = _delayed(track.commanded_kpa, first_kpa - offset_kpa, delay_s / self._period_s)
         pressure_kpa = np.empty_like(command_kpa)
-        gas_m3 = pneumatics.gas_at(first_kpa, track.volume_m3[0])
-        for k, volume_m3 in enumerate(track.volume_m3):
+        felt_m3 = actuators.felt(track.volume_m3[:, None])  # (n, b or 1, c)
+        gas_m3 = pneumatics.gas_at(first_kpa, felt_m3[0])
+        for k, volume_m3 in enumerate(felt_m3):
             pressure_kpa[k] = pneumatics.pressure_of(gas_m3, volume_m3)
             gas_m3 = actuators.fill(gas_m3, volume_m3, command_kpa[k], self._period_s)
         return pressure_kpa
 
 
 def _stacked(actuators: Sequence[Actuators]) -> Actuators:
-    """Return actuators of one kind as one, with arrays (b, c) where a number differs between them."""
-    values = {}
+    """Return actuators of one kind as one, with arrays (b, c) of numbers of chambers, (b, 1) of others."""
+    values: dict[str, Any] = {}
     for item in dataclasses.fields(actuators[0]):
-        each = [getattr(one, item.name) for one in actuators]
-        values[item.name] = each[0] if np.ndim(each[0]) == 0 else np.array(each)
+        each = np.array([getattr(one, item.name) for one in actuators])
+        values[item.name] = each if each.ndim == 2 else each[:, None] if np.ptp(each) else float(each[0])
     return dataclasses.replace(actuators[0], **values)
 
 
@@ -165,15 +242,20 @@ def _delayed(command_kpa: np.ndarray, before_kpa: np.ndarray, delay: np.ndarray)
     return out
 
 
-def _volumes(log: Log, spec: ArmSpec) -> np.ndarray:
+def spring_lengths_m(log: Log, spec: ArmSpec) -> np.ndarray | None:
+    """Return the spring lengths (n, n_springs) [m] of a log, NaN where a reading is not believed."""
+    readings = log.readings_of(spec.sensor)
+    if readings is None:
+        return log.spring_m
+    return spec.spring_sensor.lengths(readings, np.nan).length_m
+
+
+def volumes_m3(spring_m: np.ndarray | None, n: int, spec: ArmSpec) -> np.ndarray:
     """Return the volumes (n, c) [m^3] of the chambers from the lengths of their springs."""
     rest_m, chambers = spec.at_chambers(spec.geometry.section_length_m), spec.chambers
     area_m2, slope_m = (np.array(spec.per_chamber(x)) for x in (chambers.area_m2, chambers.area_slope_m))
-    length_m = np.broadcast_to(rest_m, (len(log.time_s), spec.n_chambers))
-    readings, spring_m = log.readings_of(spec.sensor), log.spring_m
-    if spring_m is None and readings is not None:
-        free_m = spec.at_springs(spec.geometry.section_length_m)  # of a spring without a believed reading
-        spring_m = spec.spring_sensor.lengths(readings, free_m).length_m
+    length_m = np.broadcast_to(rest_m, (n, spec.n_chambers))
     if spring_m is not None:
-        length_m = spring_m @ chambers_of_springs(spec).T
+        free_m = spec.at_springs(spec.geometry.section_length_m)  # of a spring without a believed reading
+        length_m = np.where(np.isfinite(spring_m), spring_m, free_m) @ chambers_of_springs(spec).T
     return np.asarray(pneumatics.volume_m3(length_m, area_m2, slope_m, rest_m))

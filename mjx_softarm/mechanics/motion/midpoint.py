@@ -226,13 +226,15 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
         """Return the gas (n_chambers, *arms) after a half step, counted from the start of the period."""
         line = command_kpa, motion.command_kpa, motion.earlier_kpa
         command = in_force(*line, half, 0.5 * h, arm.own.delay_s, period_s)
-        return arm.own.actuators.fill(gas_m3, volume, command, 0.5 * h)
+        return actuators.fill(gas_m3, volume, command, 0.5 * h)
 
     # Pressures in the middle of the step
-    gas_m3 = pneumatics.gas_at(motion.pressure_kpa, volume_m3(-half_way))
+    actuators = arm.own.actuators
+    gas_m3 = pneumatics.gas_at(motion.pressure_kpa, actuators.felt(volume_m3(-half_way)))
     middle_m3 = volume_m3(0.0 * v)
-    gas_m3 = fill(gas_m3, middle_m3, 2 * k)
-    pressure_kpa = pneumatics.pressure_of(gas_m3, middle_m3)
+    felt_m3 = actuators.felt(middle_m3)
+    gas_m3 = fill(gas_m3, felt_m3, 2 * k)
+    pressure_kpa = pneumatics.pressure_of(gas_m3, felt_m3)
 
     # Forces in the middle: of the potential, of dampers and of inertia
     constant = jax.lax.stop_gradient((tendons, frames, q, pressure_kpa))
@@ -244,7 +246,9 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     force = gradient + bias + pull.reshape(v.shape) + of_joints * v
 
     # The linearised midpoint rule; each closed chamber's gas has a stiffness [N/m], area^2 dp/dV
-    gas = pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
+    gas = (
+        pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * actuators.gas_stiffness(gas_m3, middle_m3, potential.area)
+    )
     of_gas = gas.reshape(n_sections, -1, *arms)
     slope = (0.5 * h * damping).at[:, : of_gas.shape[1]].add(0.25 * h**2 * of_gas)
     matrix = mass.plus(potential.hessian, 0.25 * h**2).plus_diagonal(0.5 * h * of_joints)
@@ -253,7 +257,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     dq = h * (v + 0.5 * dv)
 
     # Pressures at the end of the step
-    end_m3 = volume_m3(dq - half_way)
+    end_m3 = actuators.felt(volume_m3(dq - half_way))
     gas_m3 = fill(gas_m3, end_m3, 2 * k + 1)
     return motion._replace(
         q=motion.q + dq, velocity=v + dv, pressure_kpa=pneumatics.pressure_of(gas_m3, end_m3)

@@ -122,14 +122,14 @@ def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
 
 
 def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mjx.Data, Array, Array]:
-    """Return data at q and velocity (nv,), spring lengths (n_springs,) [m] and chamber volumes [m^3]."""
+    """Return data at q and velocity (nv,), spring lengths (n_springs,) [m] and chamber volumes, as felt."""
     data = mjx.kinematics(model, arm.data.replace(qpos=q, qvel=velocity))
     if model.impl == mjx.Impl.JAX:  # its tendons need the bodies' motion axes
         data = mjx.com_pos(model, data)
     data, params = mjx.tendon(model, data), arm.params
     area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
     volume = pneumatics.volume_m3(chamber_lengths(data, len(params.area)), *area, params.free_length_m)
-    return data, spring_lengths(data, len(params.area)), volume
+    return data, spring_lengths(data, len(params.area)), arm.own.actuators.felt(volume)
 
 
 def _with_friction(arm: MovingArm, model: mjx.Model, data: mjx.Data) -> mjx.Model:

@@ -1,12 +1,13 @@
-"""Actuators from commanded and measured pressures, with planted pumps and regulators."""
+"""Actuators from commands with measured pressures, or with springs; planted pumps and regulators."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from calib.arm import CalibratedArm
-from calib.fit.motion.actuators import fit_actuators, with_actuators
+from calib.fit.motion.actuators import ArmLag, fit_actuators, with_actuators
 from calib.fit.motion.tracks import find_tracks
 from calib.read.measurements import measure
 from calib.steps import actuators
@@ -112,7 +113,7 @@ def test_a_weaker_pump_is_found(short):
 def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
     """Ramps do not show the greatest rates, and the report says so."""
     arm = RodTwin(101, spec, build=Build(per_section=3))
-    log = record(arm, spec, random_pressures(spec, 4, 0), transients=True).log
+    log = record(arm, spec, random_pressures(spec, 4, 0)).log
     fit = fit_actuators(find_tracks([log], spec), spec)
     true = draw_regulator(101, spec)
     assert fit.chosen == "regulator" and fit.held_out_rms_kpa["regulator"] < 0.3
@@ -123,9 +124,56 @@ def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
     assert section.notes == fit.notes and "The regulator is kept" in section.text
 
 
+def test_a_stiff_regulator_is_told_from_one_that_the_volume_pulls(short):
+    """Its lag comes out as planted, where the other model would need 0.4 s."""
+    plant = dataclasses.replace(REGULATOR, lag_s=0.8, volume_share=0.0)
+    fit = fit_actuators(find_tracks([log_of(short, plant)], short), short)
+    found = fit.spec.actuators
+    assert found.volume_share < 0.05 and fit.half_width_95["volume_share"][0] < 0.1
+    np.testing.assert_allclose(np.delete(found.lag_s, STILL), 0.8, rtol=0.05)
+    assert fit.held_out_rms_kpa["regulator"] < 0.2 and not fit.warnings
+
+
+def test_actuators_of_another_kind_are_said_to_be(short):
+    """A second lag, in a row with the first, is no regulator of ours."""
+    log = log_of(short, dataclasses.replace(REGULATOR, lag_s=0.8))
+    kpa = log.pressure_kpa.copy()
+    for k in range(1, len(kpa)):
+        kpa[k] = kpa[k - 1] + 0.05 * (log.pressure_kpa[k] - kpa[k - 1])
+    fit = fit_actuators(find_tracks([dataclasses.replace(log, pressure_kpa=kpa)], short), short)
+    assert "yours are of another kind, and the intervals may not hold" in " ".join(fit.warnings)
+
+
+def test_springs_show_regulators_whose_pressures_are_not_measured(short):
+    """Springs follow the pressures with lags of their own, in stretching and in bending."""
+    plant = dataclasses.replace(REGULATOR, lag_s=0.6, volume_share=0.0)
+    log = log_of(short, plant)
+    slope_kpa_per_m, lags_s = 1e3, (0.25, 0.12)
+    kpa = log.pressure_kpa - log.pressure_kpa[0]
+    mean = np.repeat(kpa.mean(axis=1, keepdims=True), 3, axis=1)
+    parts = [
+        lfilter([0.0, -np.expm1(-PERIOD_S / T)], [1.0, -np.exp(-PERIOD_S / T)], part, axis=0)
+        for part, T in zip((mean, kpa - mean), lags_s, strict=True)
+    ]
+    spring_m = 0.2 + (sum(parts) + log.pressure_kpa[0]) / slope_kpa_per_m
+    hidden = dataclasses.replace(log, spring_m=spring_m, pressure_kpa=log.commanded_kpa, commanded_kpa=None)
+    assert find_tracks([hidden], short) == []
+    tracks = find_tracks([hidden], short, lambda spring_m: slope_kpa_per_m * (spring_m - 0.2))
+    fit = fit_actuators(tracks, short, arm=ArmLag.of_shape(0.25, 0.1))
+    moved = np.arange(3) != STILL
+    for name in ("lag_s", "dead_time_s"):
+        found, true = np.array(getattr(fit.spec.actuators, name)), np.full(3, getattr(plant, name))
+        np.testing.assert_allclose(found[moved], true[moved], rtol=0.15, err_msg=name)
+        assert (np.abs(found - true) < fit.half_width_95[name])[moved].all()
+
+
 def test_a_log_without_commands_or_of_poses_alone_says_so(short):
     log = log_of(short, short.actuators)
     rows = np.arange(0, len(log), 50)
     for unfit in (dataclasses.replace(log, commanded_kpa=None), log.take(rows)):
         arm, section, _ = actuators(measure([unfit], short), CalibratedArm(short), 0)
-        assert arm.spec == short and "No log has commanded and measured pressures" in section.text
+        assert (
+            arm.spec == short
+            and "No log has commands and pressures" in section.text
+            and "not known" in section.notes[0]
+        )

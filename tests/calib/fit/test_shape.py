@@ -39,7 +39,7 @@ def log_of(factor, n=4):
     """A log of an arm with the specification's bending damping times a factor, at n random pressures."""
     damping = factor * SPEC.backbone.bending_damping_nms_per_rad
     arm = SPEC.replace(backbone={"bending_damping_nms_per_rad": damping})
-    return record(Twin(0, arm, build=IDEAL), arm, random_pressures(arm, n, 0), transients=True).log
+    return record(Twin(0, arm, build=IDEAL), arm, random_pressures(arm, n, 0)).log
 
 
 @pytest.fixture(scope="module")

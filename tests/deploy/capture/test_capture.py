@@ -146,7 +146,7 @@ def test_commands_take_motion_capture(system, serve, tmp_path, monkeypatch, caps
 
     assert main(["run", "policy.npz", *on, f"--goal={goal}", "--duration", "0.5", "--log", "run.csv"]) == 1
     assert main(["measure", "policy.npz", *on, "--out", "a", "--goals", "goals.csv"]) == 1
-    assert main(["record", *on, "--out", "b.npz", "--poses", "1", "--transients"]) == 0
+    assert main(["record", *on, "--out", "b.npz", "--poses", "1"]) == 0
     told = capsys.readouterr().out
     assert len(re.findall(r"motion capture: the tip was seen in \d+ of \d+ ticks", told)) == 3
     assert "mm off by motion capture; yaw" in told and "tip and markers are missing" not in told
