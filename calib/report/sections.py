@@ -14,7 +14,7 @@ from calib.changes import Changes
 from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import PressureFit
 from calib.fit.markers import MarkerLimits
-from calib.fit.motion.actuators import MARGIN, SMALL_KPA, ActuatorFit
+from calib.fit.motion.actuators import MARGIN, MARGIN_BY_SPRINGS, SMALL_KPA, ActuatorFit
 from calib.fit.motion.damping import DampingFit
 from calib.fit.motion.shape import ShapeFit
 from calib.fit.parameters import BENDING, BOND, without_effect
@@ -295,7 +295,8 @@ def actuators(fit: ActuatorFit) -> Section:
 
 def _kept(fit: ActuatorFit) -> str:
     """Say why these actuators are kept."""
-    better = f"better by more than {100 * (MARGIN - 1):.0f} % and {SMALL_KPA:g} kPa"
+    margin = MARGIN if fit.arm_lag_s is None else MARGIN_BY_SPRINGS
+    better = f"better by more than {100 * (margin - 1):.0f} % and {SMALL_KPA:g} kPa"
     if fit.chosen == "regulator":
         return f"The regulator is kept, since at held-out seconds it is {better}."
     kept = "pump" if fit.chosen == "pump" else "specification's actuators"
