@@ -21,7 +21,13 @@ import numpy as np
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
-from calib.fit.motion.tracks import clusters, dense_parts, driven_kpa, spring_lengths_m
+from calib.fit.motion.tracks import (
+    clusters,
+    dense_parts,
+    driven_kpa,
+    has_commands_alone,
+    spring_lengths_m,
+)
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import PerSection, scaled
 from mjx_softarm.logs.rest import HOLD_KPA
@@ -148,7 +154,7 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
             if left == 0 or len(grid) < shortest:
                 continue
             pressure = log.pressure_kpa[rows[newest]]
-            if log.commanded_kpa is None:
+            if has_commands_alone(log):
                 next_row = rows[
                     np.minimum(newest + 1, len(rows) - 1)
                 ]  # has the command that was in force before it

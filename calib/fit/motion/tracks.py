@@ -57,6 +57,16 @@ def dense_parts(
         yield rows, grid, np.searchsorted(time_s, grid + 1e-6, side="right") - 1
 
 
+def has_commands_alone(log: Log) -> bool:
+    """Return whether the pressures of a log are commands: most do not change at all from row to row."""
+    return (
+        log.commanded_kpa is None
+        and log.pressure_kpa is not None
+        and len(log) > 1
+        and not np.median(np.abs(np.diff(log.pressure_kpa, axis=0)))
+    )
+
+
 def driven_kpa(commanded_kpa: np.ndarray, spring_m: np.ndarray | None, spec: ArmSpec) -> np.ndarray:
     """Return the pressures (n, c) [kPa] that an arm's actuators make of commands.
 
@@ -106,7 +116,7 @@ def find_tracks(
         spring_m: Any = spring_lengths_m(log, spec)
         commanded_kpa, followed = log.commanded_kpa, log.pressure_kpa
         if resting_kpa is not None:
-            commanded_kpa, followed = (log.pressure_kpa if log.commanded_kpa is None else None), spring_m
+            commanded_kpa, followed = (log.pressure_kpa if has_commands_alone(log) else None), spring_m
         if commanded_kpa is None or followed is None or len(log) < 2:
             continue
         volume_m3 = volumes_m3(spring_m, len(log), spec)

@@ -72,6 +72,16 @@ def test_a_slower_log_is_brought_to_the_control_rate_with_pressures_held(log):
     np.testing.assert_allclose(found.tip_m[1::2], 0.5 * (slow.tip_m[1:] + slow.tip_m[:-1]), atol=1e-9)
 
 
+def test_commands_drive_the_arm_through_its_actuators(log):
+    """Logged pressures without noise are commands, which a pump of 12 L/min follows later."""
+    commands = moving_log(SPEC, steps(15), noise=0.0)
+    (found,) = find_stretches([commands], SPEC)
+    late_kpa = np.abs(found.pressure_kpa - commands.pressure_kpa[: len(found.pressure_kpa)]).max(axis=1)
+    within = np.arange(len(late_kpa)) % round(RATE_HZ)  # ticks since the step
+    assert late_kpa[50:][within[50:] < 2].min() > 3.0
+    assert late_kpa[50:][within[50:] > 48].mean() < 0.2 * late_kpa[50:][within[50:] < 2].mean()
+
+
 def test_stretches_end_at_gaps_where_the_payload_changes_and_at_the_longest_time(log):
     time_s = log.time_s + np.where(log.time_s >= 7.5, 3.0, 0.0)
     assert len(find_stretches([dataclasses.replace(log, time_s=time_s)], SPEC)) == 2
