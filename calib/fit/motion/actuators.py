@@ -65,9 +65,9 @@ MISFIT, SMALL_MISFIT_KPA = (
     4.0,
     0.15,
 )  # error, in the noise of the pressures and at least, of another kind of actuator
-# Greatest distance of a converged fit from its minimum, in standard deviations; dead times are interpolated
-# between ticks, and the errors have kinks there
-SMALL_STEP = 0.5
+# Greatest distance of a converged fit from its minimum, in standard deviations, RMS over the parameters; dead
+# times are interpolated between ticks, and the errors have kinks there
+SMALL_STEP = 0.2
 KNOWN = 0.3  # relative half-width of an interval up to which a number counts as known
 # Ratio of errors by the springs up to which the simpler actuators are better: hysteresis of the arm looks
 # like a deadband. Regulators fitted to the paper's pumps leave 1.0 instead of 1.15 kPa, to regulators of 1.2
@@ -339,7 +339,8 @@ def _half_widths(regulator: Regulator, solution: Solution, log_std: float) -> di
 
 
 def _warnings(done: ActuatorFit, solution: Solution) -> tuple[str, ...]:
-    said = [] if solution.decrement < 0.5 * SMALL_STEP**2 else ["the fit did not converge: log for longer"]
+    converged = solution.decrement < 0.5 * SMALL_STEP**2 * len(solution.x)
+    said = [] if converged else ["the fit did not converge: log for longer"]
     said += [
         f"{name} is known to {100 * share:.0f} % only: log larger steps of the commands"
         for name, share in _uncertain(done).items()
