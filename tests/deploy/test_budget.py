@@ -39,6 +39,7 @@ load = POLICY.estimator.load_layers[0]
 MOVED = POLICY.estimator._replace(load_layers=((load[0], load[1] + np.float32([0.003, 0, 0] * 6)),))
 ERRORS = {"tip_mm": {"0 kg": {"median": 0.3}, "1 kg": {"median": 9.0}}}
 KNOWN = dataclasses.replace(POLICY, s2r=NO_CHANGE, estimator=MOVED, provenance={"estimator_errors": ERRORS})
+POLICY_WITHOUT_SINK = dataclasses.replace(KNOWN, estimator=POLICY.estimator)  # a payload moves no tip
 WEAK = dataclasses.replace(KNOWN, gains=KNOWN.gains._replace(pressure_max_kpa=np.full(N, 8.0)))
 CIRCLE = np.random.default_rng(5).uniform(-20, 10, (8, N)) @ GAIN_M_PER_KPA.T + REST_M
 GOALS_OF_CIRCLE = tip_pose(KNOWN, CIRCLE, 0.0)[0].astype(float)
@@ -173,6 +174,17 @@ def test_a_wrong_calibration_is_named_whatever_payload_the_loop_reads_from_it(be
     run = believing(go(far, goals=GOALS_OF_CIRCLE, controller=controller), believed_kg)
     result = budget(run, controller, None)
     assert result.total_mm > 20.0 and result.wrong and "likely another arm" in result.lines()[-1]
+
+
+def test_zeros_of_an_aged_arm_are_found_although_the_loop_takes_them_for_a_payload():
+    """Zeros 2 mm off move the tip by more than 1 % of the arm's length, and the loop believes 0.3 kg."""
+    controller = Controller.of(POLICY_WITHOUT_SINK, nearest_springs)
+    run = go(
+        Planted(shift_m=2 * SHIFT_M, policy=POLICY_WITHOUT_SINK), goals=GOALS_OF_CIRCLE, controller=controller
+    )
+    result = budget(believing(run, 0.3), controller, None)
+    assert result.total_mm > result.wrong_mm and not result.wrong
+    assert result.largest == "springs" and "--since" in result.lines()[-1]
 
 
 def test_an_arm_that_the_policy_does_not_know():
