@@ -161,7 +161,7 @@ def _measure(
     goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
     points: int = 16,
     seconds: float | None = None,
-    payload: float = 0.0,
+    payload: float | None = None,
 ) -> int:
     """Measure a policy's accuracy on an arm with motion capture, and say what makes the error.
 
@@ -170,10 +170,11 @@ def _measure(
         goals: circle; grid, over the workspace; or a CSV file of poses
         points: of the circle, or of the grid at most
         seconds: pass all goals without a stop in so long [s], from the first to the last
-        payload: mass that hangs at the gripper, which the loop is not given; a simulated arm gets it [g]
+        payload: mass that hangs at the gripper, which the loop is not given; a simulated arm gets it [g];
+            None: the loop's estimate counts
     """
     # Checks, before the arm moves
-    if not 0.0 <= payload < np.inf:
+    if payload is not None and not 0.0 <= payload < np.inf:
         raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
@@ -189,12 +190,13 @@ def _measure(
 
     # The run, stop by stop or in time
     out.mkdir(parents=True)
-    payload_kg = controller.policy.spec.mass.payload_kg + 1e-3 * payload
+    payload_kg = None if payload is None else controller.policy.spec.mass.payload_kg + 1e-3 * payload
     if payload and hasattr(driver, "attach"):
         driver.attach(payload_kg)
 
     def save(log: Log) -> None:
-        save_log(out / "log.npz", replace(log, payload_kg=np.full(len(log), payload_kg)))
+        known_kg = None if payload_kg is None else np.full(len(log), payload_kg)
+        save_log(out / "log.npz", replace(log, payload_kg=known_kg))
 
     if seconds is None:
         run = follow(driver, controller, poses, tell=tell, save=save)
@@ -204,7 +206,7 @@ def _measure(
     finish(driver, tell)
     print_run(run, controller.policy)
     if run.arrivals:
-        _report_accuracy(run, controller, poses, out, payload_kg if seconds is None else None)
+        _report_accuracy(run, controller, poses, out, payload_kg)
     print_origin(controller.policy, options.arm)
     return run.status
 
@@ -219,7 +221,7 @@ def _report_accuracy(
         controller: its policy.
         poses (p, 6) [mm, deg]: goals.
         out: folder to write to.
-        payload_kg: payload at the gripper; None: do not say what makes the error.
+        payload_kg: payload at the gripper; None: not known.
     """
     accuracy = measure(run, controller, poses)
     ways = ways_of(run)
@@ -228,7 +230,7 @@ def _report_accuracy(
         "seconds": float(run.log.time_s[-1]),
         **(along(ways, controller.dt_s) if ways else {}),
     }
-    split = None if payload_kg is None else budget(run, controller, payload_kg)
+    split = None if ways else budget(run, controller, payload_kg)
     if split is not None:
         numbers["budget"] = split.figures()
     if missing := write_accuracy(out, accuracy, numbers, ways):

@@ -39,6 +39,7 @@ load = POLICY.estimator.load_layers[0]
 MOVED = POLICY.estimator._replace(load_layers=((load[0], load[1] + np.float32([0.003, 0, 0] * 6)),))
 ERRORS = {"tip_mm": {"0 kg": {"median": 0.3}, "1 kg": {"median": 9.0}}}
 KNOWN = dataclasses.replace(POLICY, s2r=NO_CHANGE, estimator=MOVED, provenance={"estimator_errors": ERRORS})
+POLICY_WITHOUT_SINK = dataclasses.replace(KNOWN, estimator=POLICY.estimator)  # a payload moves no tip
 WEAK = dataclasses.replace(KNOWN, gains=KNOWN.gains._replace(pressure_max_kpa=np.full(N, 8.0)))
 CIRCLE = np.random.default_rng(5).uniform(-20, 10, (8, N)) @ GAIN_M_PER_KPA.T + REST_M
 GOALS_OF_CIRCLE = tip_pose(KNOWN, CIRCLE, 0.0)[0].astype(float)
@@ -105,9 +106,13 @@ def test_shifts_of_the_springs_zeros_are_found_as_far_as_eight_goals_tell():
 @pytest.mark.parametrize(
     ("parts_mm", "shift_mm", "n_goals", "remedy"),
     [
-        # Parts that cancel, or zeros that no sensor loses, are of another arm; an aged one is not
-        ({"policy": -2.7, "law": 4.97}, 0.0, 8, "likely another arm"),
+        # Zeros that no sensor loses, or a large rest, are of another arm; an aged one is not, nor are parts
+        # that cancel, nor an error that nobody would call one
+        ({"policy": -2.7, "law": 4.97}, 0.0, 8, "take goals further inside"),
+        ({"payload": -4.95, "rest": 6.08}, 0.0, 8, "record poses anew"),
+        ({"policy": 0.0, "law": 0.1, "springs": 4.0}, 11.0, 8, "--since"),
         ({"policy": 0.0, "law": 0.1, "springs": 55.0}, 11.0, 8, "likely another arm"),
+        ({"policy": 0.0, "law": 0.1, "rest": 26.0}, 0.0, 8, "likely another arm"),
         ({"policy": 0.0, "law": 0.1, "springs": 7.3}, 1.3, 8, "--since"),
         ({"law": 0.1, "rest": 2.0}, 0.0, MIN_POSES, "record poses anew"),
         # `calib run --since` refuses fewer
@@ -116,9 +121,10 @@ def test_shifts_of_the_springs_zeros_are_found_as_far_as_eight_goals_tell():
     ],
 )
 def test_remedies(parts_mm, shift_mm, n_goals, remedy):
-    parts = Budget(parts_mm, np.full(N, shift_mm), 0.0, 0.0, 0.2, n_goals, 3, calibrated=True)
-    assert remedy in parts.lines()[1] and parts.strange == ("another arm" in remedy)
-    assert not parts._replace(calibrated=False).strange
+    known = {"loaded": False, "wrong_mm": 6.0, "calibrated": True}
+    parts = Budget(parts_mm, np.full(N, shift_mm), 0.0, 0.0, 0.2, n_goals, 3, **known)
+    assert remedy in parts.lines()[1] and parts.wrong == ("another arm" in remedy)
+    assert not parts._replace(calibrated=False).wrong
 
 
 def test_errors_as_at_the_calibration_are_the_models():
@@ -136,6 +142,49 @@ def test_errors_with_a_payload_are_no_shift_of_the_zeros():
     assert not found.shift_mm.any() and found.parts_mm["springs"] == 0.0
     assert found.parts_mm["rest"] > 1.0
     assert split(Planted(off_mm=off_mm)).shift_mm.any()
+
+
+def believing(run, kg):
+    """Return the run as of a loop that believed a payload."""
+    return run._replace(log=dataclasses.replace(run.log, load_kg=np.full(len(run.log), kg)))
+
+
+def test_a_payload_that_nobody_gives_is_the_loops_own_estimate():
+    """Half a kilogram hangs; the loop knows, and nobody says so: no part cancels another, no arm is accused.
+
+    With --payload 0 the user says that nothing hangs: the payload's part is then its effect.
+    """
+    controller = Controller.of(KNOWN, nearest_springs)
+    off_mm = np.array([0.3, 0.0, 0.4])
+    arm = Planted(payload_kg=0.5, off_mm=off_mm)
+    run = believing(go(arm, goals=GOALS_OF_CIRCLE, controller=controller), 0.5)
+    unsaid, wrong = budget(run, controller, None), budget(run, controller, 0.0)
+    assert unsaid.loaded and unsaid.payload_g is None and unsaid.believed_g == pytest.approx(500.0)
+    assert unsaid.parts_mm["payload"] == 0.0 and not unsaid.shift_mm.any() and not unsaid.wrong
+    assert abs(wrong.parts_mm["payload"]) > 1.0 and not wrong.wrong
+    assert "payload: 500 g by the loop's estimate" in unsaid.lines()[0]
+    assert "--payload says 0 g" not in unsaid.lines()[-1] and len(wrong.lines()) == 2
+
+
+@pytest.mark.parametrize("believed_kg", [0.02, 0.4])
+def test_a_wrong_calibration_is_named_whatever_payload_the_loop_reads_from_it(believed_kg):
+    """Models 26 mm off, as of another twin, which the loop takes for a payload of up to 0.4 kg."""
+    controller = Controller.of(KNOWN, nearest_springs)
+    far = Planted(off_mm=np.array([15.0, -15.0, 15.0]))
+    run = believing(go(far, goals=GOALS_OF_CIRCLE, controller=controller), believed_kg)
+    result = budget(run, controller, None)
+    assert result.total_mm > 20.0 and result.wrong and "likely another arm" in result.lines()[-1]
+
+
+def test_zeros_of_an_aged_arm_are_found_although_the_loop_takes_them_for_a_payload():
+    """Zeros 2 mm off move the tip by more than 1 % of the arm's length, and the loop believes 0.3 kg."""
+    controller = Controller.of(POLICY_WITHOUT_SINK, nearest_springs)
+    run = go(
+        Planted(shift_m=2 * SHIFT_M, policy=POLICY_WITHOUT_SINK), goals=GOALS_OF_CIRCLE, controller=controller
+    )
+    result = budget(believing(run, 0.3), controller, None)
+    assert result.total_mm > result.wrong_mm and not result.wrong
+    assert result.largest == "springs" and "--since" in result.lines()[-1]
 
 
 def test_an_arm_that_the_policy_does_not_know():
