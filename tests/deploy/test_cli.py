@@ -11,7 +11,7 @@ import pytest
 from calib.read.logs import read_log
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.drivers.names import open_arm, twin_spec
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.spec import ArmSpec
 from tests.linear_arm import FAR, GOALS, POLICY, REST_M, SENSOR, LinearArm, N
@@ -155,19 +155,6 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
     written = np.loadtxt(folder / "written.txt")
     assert np.abs(written).max() > 3.0 and not written[-1].any()
     assert (folder / "a.csv").read_text().count("\n") == 1 + 25
-
-
-@pytest.mark.parametrize(
-    ("name", "spec"),
-    [
-        ("twin:7", None),
-        ("twin:7@my/arm.toml", "my/arm.toml"),
-        ("twin:rod:7@sopra:aged:500g", "sopra"),
-        ("module:Arm", None),
-    ],
-)
-def test_a_twin_names_its_own_arm(name, spec):
-    assert twin_spec(name) == (spec and Path(spec))
 
 
 @pytest.mark.parametrize(

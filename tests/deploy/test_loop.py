@@ -29,7 +29,6 @@ from tests.linear_arm import (
     GOALS,
     NOISE_M,
     POLICY,
-    SENSOR,
     SPEC,
     SPRINGS_M,
     LinearArm,
@@ -144,16 +143,6 @@ def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower, uncor
     assert behind_m.max() < 2e-4 < 1e-3 < asked_m.max()
 
 
-def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():
-    spec = SPEC.replace(
-        control={"ki_kpa_per_ms": SPEC.control.ki_kpa_per_ms / 10.0}, geometry={"spring_radius_m": 0.0335}
-    )
-    slow = Controller.of(dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec)))
-    assert slow.window > 1.5 * CONTROLLER.window
-    assert slow.rest.still_m == pytest.approx(0.5 * CONTROLLER.rest.still_m) == 1e-4
-    assert slow.rest.arrived_m == pytest.approx(0.5 * CONTROLLER.rest.arrived_m) == 1.25e-4
-
-
 def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag(uncorrected, monkeypatch):
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     plan, asked = asking(between, arm)
@@ -187,13 +176,6 @@ def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
     lasted = [rows.stop - rows.start for rows in run.ways]
     np.testing.assert_allclose(lasted, [150, 100], atol=1)
     np.testing.assert_allclose(run.log.goal[run.ways[1]][50], goals[4], atol=1e-6)
-
-
-def test_policy_itself_plans_by_default():
-    run = go(LinearArm(), goals=GOALS[:1], controller=Controller.of(POLICY), duration_s=0.1)
-    middle_hz = np.mean(POLICY.actions[1:], axis=0)  # the actor's weights are zero
-    got_hz = SENSOR.readings(run.log.reference_m[1])
-    np.testing.assert_allclose(got_hz, middle_hz, rtol=1e-6)
 
 
 def test_state_is_not_changed_in_place():

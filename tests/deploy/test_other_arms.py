@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from mjx_softarm._support.errors import InputError
-from mjx_softarm.control import at_chambers
 from mjx_softarm.deploy.belief import stuck_springs
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drive import Drive, Hold
 from mjx_softarm.deploy.drivers.names import check_arm, check_number
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.safety import Fault
@@ -16,7 +13,7 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.twin.arm import Twin
-from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS
+from tests.arms import FOUR_CHAMBERS
 from tests.linear_arm import Leaking, LinearArm, gain_of, make_policy
 
 
@@ -120,23 +117,6 @@ def test_record_of_other_arms(other_arm):
     length_m = other_arm.spring_sensor.lengths(found.log.readings).length_m
     expected_m = springs_at(other_arm, 0.3 * targets_kpa[0])
     np.testing.assert_allclose(length_m[0], expected_m, atol=2e-4)
-
-
-def test_hold_of_other_arms(other_arm):
-    """References that no plane meets are held as well as a plane can."""
-    drive = Drive(LinearArm(spec=other_arm), other_arm)
-    n_springs = other_arm.n_springs
-    spring_m = springs_at(other_arm, np.full(other_arm.n_chambers, -5.0))
-    spring_m = spring_m + (1e-3 * (-1.0) ** np.arange(n_springs) if other_arm is FOUR_CHAMBERS else 0.0)
-    row = drive.to_rest(Hold(drive.gains, spring_m, drive.dt_s))
-    off_m = drive.sensor.lengths(row["readings"]).length_m - spring_m
-    assert np.abs(at_chambers(off_m, drive.gains.allocation)).max() < 3e-4
-
-
-def test_another_number_of_springs_is_refused():
-    """Readings are counted by springs, not by chambers."""
-    with pytest.raises(InputError, match="test: got 12 readings, expected 9, of the 3 sections of 'six'"):
-        check_number(LinearArm(spec=FOUR_CHAMBERS), SIX_CHAMBERS, "test")
 
 
 def test_twin_is_led_to_a_goal(other_arm):

@@ -82,15 +82,6 @@ def test_a_matrix_that_is_not_positive_definite_gives_nan_and_its_neighbours_do_
     assert np.isnan(found[2]).all()
 
 
-def test_the_diagonal_is_added_where_it_belongs():
-    hessian, _ = chain(2)
-    one = jax.tree.map(lambda x: jnp.asarray(x[0]), hessian)
-    added = jnp.arange(2.0 * N)
-    np.testing.assert_allclose(
-        one.plus_diagonal(added).dense(), dense(hessian)[0] + np.diag(added), atol=1e-5
-    )
-
-
 @pytest.mark.parametrize("n", [1, 3, 4, 7])
 def test_elimination_of_rows_of_which_some_are_the_identity_s(n):
     rng = np.random.default_rng(n)

@@ -234,15 +234,6 @@ def test_commands_in_force_are_their_mean_over_the_time_before_the_dead_time():
         before, earlier = command, pushed(earlier, before)
 
 
-def test_a_command_waits_for_the_valves(short):
-    start, asked, move = short
-    delays = MotionParams(delay_s=PERIOD_S), MotionParams()
-    late, soon = (move(*start, asked, own).pressure_kpa for own in delays)
-    np.testing.assert_allclose(late[:, 0], start.pressure_kpa, atol=1e-2)
-    assert np.abs(soon[:, 0] - start.pressure_kpa).max() > 0.3
-    assert np.abs(late[:, 1] - start.pressure_kpa).max() > 0.3
-
-
 @pytest.mark.parametrize(("engine", "step_s", "most_mm"), [(midpoint, PERIOD_S, 0.3), (mjx_step, 0.005, 0.8)])
 def test_arms_behind_slow_regulators_move_as_c_mujoco_does(engine, step_s, most_mm):
     """Commands wait for no, two and a half, and some four control periods."""

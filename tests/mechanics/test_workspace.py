@@ -113,13 +113,6 @@ def test_many_pressures_are_settled_each_in_its_place():
     np.testing.assert_allclose(found.q[-3:], last.q, atol=1e-6)
 
 
-def test_extremes_are_all_combinations_of_lowest_zero_and_highest():
-    found = extreme_poses(SMALL)
-    expected = set(itertools.product((LOW_KPA, 0.0, HIGH_KPA), repeat=3))
-    assert set(map(tuple, found.pressure_kpa.tolist())) == expected and len(found.pressure_kpa) == 27
-    assert found.settled.all()
-
-
 def coverage_mm(found):
     """Extent along y and z."""
     return 1e3 * np.ptp(found.tip_position_m[:, 1:], axis=0)

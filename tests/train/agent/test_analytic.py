@@ -111,11 +111,3 @@ def test_a_policy_is_adopted_and_may_observe_less():
     for other, given in (new(57, hidden=(8,)), new(19)):  # another size, and other things rather than less
         with pytest.raises(ValueError, match="actor: got layers of"):
             wider.adopt(state, other.parts(given))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("horizon", 0)]
-)
-def test_a_setting_out_of_range_is_named(name, value):
-    with pytest.raises(ValueError, match=f"learner.{name}: got {value}"):
-        dataclasses.replace(CONFIG, **{name: value})

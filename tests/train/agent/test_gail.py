@@ -79,15 +79,6 @@ def test_an_update_descends_on_the_loss_and_its_penalty():
     assert last["accuracy"] > 0.9
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("learning_rate", -1.0), ("gradient_penalty", -1.0), ("input_scale", 0.0), ("penalty_on", "D")],
-)
-def test_a_bad_setting_is_named(name, value):
-    with pytest.raises(ValueError, match=f"learner.gail.{name}: got"):
-        GailConfig(**{name: value})
-
-
 @pytest.mark.slow
 def test_an_expert_is_recovered_from_its_actions_alone():
     """Eight goals in the plane; the reward is the learned one, a quarter of a batch the expert's."""
