@@ -12,9 +12,9 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.state import State
+from tests.arms import SHORT
 
 MM, KPA = 1e-3, 1.0
-SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2, sensor_noise_mm=2.0)
 
 
@@ -205,7 +205,7 @@ class Few(NamedTuple):
 
 @pytest.fixture(
     scope="module",
-    params=[SHORT_ARM, pytest.param(ArmSpec.default(), marks=pytest.mark.slow)],
+    params=[SHORT, pytest.param(ArmSpec.default(), marks=pytest.mark.slow)],
     ids=["short", "paper"],
 )
 def few(request, quick_compiler):

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.__main__ import _tell_lengths, main
+from mjx_softarm.__main__ import main
 from mjx_softarm.mechanics.drawing.workspace_plot import outline
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
@@ -155,11 +155,6 @@ def test_the_outline_of_a_notched_square_keeps_the_notch():
     assert np.linalg.norm(filled[:, 0] - filled[:, 1], axis=1).sum() == pytest.approx(4 * 10)
 
 
-@pytest.mark.parametrize("points", [np.zeros((2, 2)), np.stack([np.arange(5.0)] * 2, axis=1)])
-def test_points_on_a_line_have_no_outline(points):
-    assert outline(points, gap=1.0).shape == (0, 2, 2)
-
-
 def run(*arguments):
     """Exit code, and what was printed and complained about."""
     out, err = io.StringIO(), io.StringIO()
@@ -184,7 +179,7 @@ def test_spec_writes_the_default_arm_with_its_sources_and_replaces_nothing(tmp_p
     assert ArmSpec.from_toml(path) == SPEC
 
 
-def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatch, capsys):
+def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatch):
     SMALL.to_toml(tmp_path / "small.toml")
     code, printed, complaint = run("workspace", "--spec", tmp_path / "small.toml", "--out", tmp_path / "new")
     assert (code, complaint) == (0, "")
@@ -195,15 +190,7 @@ def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatc
     reached_mm = [1e3 * f(extreme_poses(SMALL).spring_m) for f in (np.min, np.max)]
     asked = "springs.length_min_m and length_max_m: 85 to 275 mm"
     assert "springs: {:.0f} to {:.0f} mm; {}\n".format(*reached_mm, asked) in printed
-    image = matplotlib.image.imread(tmp_path / "new" / "workspace.png")
-    crimson = np.abs(image[..., :3] - [0.863, 0.078, 0.235]).max(-1) < 0.05
-    assert image.shape[1] > image.shape[0] > 600 and crimson.sum() > 500  # the boundary is there
-
-    # Limits far from what the springs reach are reported
-    far = SMALL.replace(springs={"length_max_m": 0.35})
-    _tell_lengths(far, np.array([[0.1, 0.2, 0.26]]))
-    asked = "length_max_m: 85 to 350 mm, expected about what they reach"
-    assert f"springs: 100 to 260 mm; springs.length_min_m and {asked}" in capsys.readouterr().out
+    assert matplotlib.image.imread(tmp_path / "new" / "workspace.png").shape[0] > 600
 
     # The paper's numbers stand beside its own arm alone, here at fewer pressures.
     few = random_pressures(SPEC, 32, seed=0)
@@ -211,6 +198,7 @@ def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatc
     code, of_paper, _ = run("workspace", "--out", tmp_path)
     assert code == 0 and "paper" not in printed
     assert re.search("lateral .* mm, paper 400.0 mm\n.*vertical .* mm, paper 350.0 mm\n", of_paper)
+    assert "expected about what they reach" in of_paper  # the few pressures do not reach the limits
 
 
 def test_picture_draws_the_arm_at_its_pressures(tmp_path):
@@ -243,8 +231,6 @@ def test_an_arm_that_does_not_settle_by_itself_is_told_by_its_file(tmp_path):
         (["dance"], "got 'dance', expected one of spec, picture, workspace"),
         (["picture", "--pressures", "1", "2"], "got 2 numbers, expected 1 or 9"),
         (["picture", "--pressures", "21"], "got 21, expected -40 to 20 kPa"),
-        (["picture", "--pressures", "nan"], "got nan, expected -40 to 20 kPa"),
-        (["picture", "--spec", "missing.toml"], "missing.toml: got 'No such file"),
         (["workspace", "--spec", "missing.toml"], "missing.toml: got 'No such file"),
         (["spec", "--out", "no/such/folder/arm.toml"], "No such file or directory"),
     ],

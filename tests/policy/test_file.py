@@ -16,7 +16,7 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support import archive
 from mjx_softarm._support.archive import SealedFileError, sealed
 from mjx_softarm.control import Gains, allocation
-from mjx_softarm.mdp.observation import OBS_LAYOUT, layouts
+from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
@@ -215,17 +215,13 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
     ("changes", "message"),
     [
         ({"actor__n_layers": np.array(0)}, "actor.n_layers: got 0, expected at least 1"),
-        ({"actor__n_layers": np.array(2)}, "actor.1.bias: got float32 (5,), expected float32 (9,)"),
         ({"observation": np.array("force")}, "observation: got force, expected pose or payload or motion"),
         ({"observation": np.array("payload")}, "obs_layout: got ['pose_x_mm', "),
-        ({"obs_layout": np.array(OBS_LAYOUT[::-1])}, "obs_layout: got ['error_roll_deg', "),
         ({"action_layout": np.array(["voltage0"] * 9)}, "action_layout: got ['voltage0', 'voltage0', "),
         ({"obs_scale__scale": np.zeros(6)}, "obs_scale.scale: got [0.0, "),
         ({"action__low": np.full(9, 5e6)}, "action.low: got [5000000.0, "),
-        ({"sensor__delta_m": np.full(9, -1.0)}, "action.low: got "),
         ({"gains__pressure_min_kpa": np.array(20.0)}, "gains.pressure_min_kpa: got 20.0, expected less than"),
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
-        ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
         ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 16"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import ReachEnv
-from tests.train.small import CONFIG, LEARNER, SHORT
+from tests.arms import SHORT
+from tests.train.small import CONFIG, LEARNER
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import GoalStage, ImitationConfig

@@ -20,7 +20,8 @@ from mjx_softarm.mechanics import workspace
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
-from tests.train.small import CONFIG, SHORT, distil_little, flags, new_job
+from tests.arms import SHORT
+from tests.train.small import CONFIG, distil_little, flags, new_job
 from train.__main__ import main
 from train.runs.folder import Run, sole_trainer
 

@@ -14,8 +14,9 @@ from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
+from tests.arms import SHORT
 from tests.train import small
-from tests.train.small import SHORT, new_job
+from tests.train.small import new_job
 from train import sweep
 from train.__main__ import main
 from train.config import override

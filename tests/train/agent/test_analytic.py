@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
-from mjx_softarm.spec import ArmSpec
+from tests.arms import SHORT
 from train.agent.analytic import Analytic, AnalyticConfig, GradientEpoch
 
-SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 N_ARMS, N_UPDATES = 32, 150
 CONFIG = AnalyticConfig(hidden=(32, 32), n_arms=N_ARMS)
 FEW = dataclasses.replace(CONFIG, n_arms=4)

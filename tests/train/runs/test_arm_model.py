@@ -6,7 +6,8 @@ import pytest
 
 from calib.arm import CalibratedArm
 from mjx_softarm.policy.file import SHIPPED, load_policy
-from tests.train.small import SHORT, distil_little
+from tests.arms import SHORT
+from tests.train.small import distil_little
 from train.runs import arm_model
 from train.runs.estimator import Distilled, Error, distil
 

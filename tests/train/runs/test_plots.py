@@ -20,8 +20,7 @@ def with_errors(error_mm):
     return Reached(goal, pose, each, 0 * once, once, np.zeros((N, 9)), each, each, each)
 
 
-@pytest.mark.parametrize("median_mm", [0.0, 0.19, 1.3, 12.0])
-@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize(("median_mm", "spread"), [(0.0, 0.0), (0.19, 1.0), (1.3, 0.3), (12.0, 1.0)])
 def test_the_distribution_of_the_error_can_be_read(median_mm, spread):
     """Median and 95 % lie inside, and numbers stand below, beside and above them."""
     error_mm = median_mm * np.exp(spread * np.random.default_rng(0).normal(size=N))

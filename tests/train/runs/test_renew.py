@@ -12,7 +12,8 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.actions import SHIFT_LIMIT
-from tests.train.small import CONFIG, SHORT
+from tests.arms import SHORT
+from tests.train.small import CONFIG
 from train.runs.folder import Run
 from train.runs.renew import policy_still_accurate, renewed
 
