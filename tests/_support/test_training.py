@@ -49,12 +49,6 @@ def test_the_seed_decides_and_decay_holds_weights_back():
     assert np.linalg.norm(held_back) < 0.9 * np.linalg.norm(TRUE)
 
 
-def test_fewer_rows_than_a_batch_are_one_batch():
-    weights, losses = train(regression(15), Schedule(300, 0.1, 64))
-    assert len(losses) == 300
-    np.testing.assert_allclose(weights, TRUE, atol=0.05)
-
-
 def test_initial_layers_keep_the_magnitude_of_their_input():
     layers = initial_layers(jax.random.key(0), (64, 256, 256, 64))
     assert [w.shape for w, _ in layers] == [(64, 256), (256, 256), (256, 64)]

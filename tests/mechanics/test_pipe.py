@@ -114,18 +114,6 @@ def test_gradient_of_the_body(spec, aside_m):
     np.testing.assert_allclose(gradient[0].sum(0), [-1.0 if aside_m else 0.0, 0.0, 0.0], atol=1e-5)
 
 
-@pytest.mark.parametrize("diameter_mm", [300.0, 250.0])
-def test_containers_lie_in_their_branches(diameter_mm):
-    pipe = CrossPipe.of_mm(diameter_mm)
-    at = pipe.containers()
-    assert list(at) == ["left", "right", "bottom"]
-    radius = diameter_mm / 2000
-    np.testing.assert_allclose(at["right"], [radius + 0.06, 0.0, -0.6])
-    np.testing.assert_allclose(at["left"], at["right"] * [-1, 1, 1])
-    np.testing.assert_allclose(at["bottom"], [0.0, 0.0, -0.55 - radius - 0.06])
-    np.testing.assert_allclose([clearance(pipe, p) for p in at.values()], [radius - 0.05] * 2 + [radius])
-
-
 @pytest.mark.parametrize("diameter_mm", [0.0, -300.0, 480.0, np.nan])
 def test_impossible_diameter_is_refused(diameter_mm):
     with pytest.raises(ValueError, match=r"diameter_m: got .*, expected more than 0 and less than 0\.48"):

@@ -181,13 +181,6 @@ def test_arm_that_touches_nothing_moves_as_without_a_pipe():
     np.testing.assert_allclose(*tips_m, atol=1e-9)
 
 
-def test_without_a_pipe_nothing_can_touch():
-    model = Twin(7)._model
-    assert not model.geom_contype.any() and not model.geom_conaffinity.any() and model.nmesh == 0
-    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    assert model.opt.disableflags & off == off
-
-
 @pytest.mark.parametrize("diameter_mm", [300.0, 250.0])
 def test_survives_random_extremes_in_the_pipe(diameter_mm):
     """Chambers at their limits, redrawn at random; only arm and pipe touch, and the arm stays inside."""

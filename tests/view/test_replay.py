@@ -73,13 +73,15 @@ def test_long_log_is_shared_faster(path, tmp_path, monkeypatch):
 
 
 def test_command_line(path, tmp_path, capsys):
+    (tmp_path / "other").mkdir()
     for words, message in (
         (("--html", tmp_path / "a.html"), "--html: got no log, expected one or more"),
         ((path, "--html", tmp_path / "no" / "a.html"), "expected a file in a folder that exists"),
         ((path, "--html", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .html or .htm"),
-        (("--log", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .csv or .npz or .mcap"),
         (("--demos", tmp_path / "a.mcap"), "a.mcap, expected a name that ends in .csv or .npz"),
         ((tmp_path / "no.csv",), "no.csv"),
+        ((tmp_path / "other",), "expected the folder of a run, with config.json, or of a calibration"),
+        ((tmp_path, tmp_path), "and more, expected one folder"),
     ):
         assert main([*map(str, words)]) == 2
         assert message in (error := capsys.readouterr().err) and error.count("\n") == 1
