@@ -105,13 +105,6 @@ def test_a_way_with_a_goal_out_of_reach_is_not_begun():
     np.testing.assert_array_equal(arm.written, 0.0)
 
 
-@pytest.mark.parametrize("goals", [[FAR, GOALS[0]], [GOALS[0], FAR]])
-def test_a_way_ends_at_a_stop_that_only_the_loop_refuses(goals, monkeypatch):
-    monkeypatch.setattr("mjx_softarm.deploy.session.refusals", lambda policy, goals: {})
-    run = trace(LinearArm(), CONTROLLER, np.array(goals), pace_s=1.0)
-    assert run.ending == Ending() and run.status == MISSED and run.counts() == {Fault.GOAL_OUTSIDE: 1}
-
-
 def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     run = trace(arm, Controller.of(POLICY, between), goals, pace_s=10.0)

@@ -1,7 +1,6 @@
 """Moving goals and policies of motion: corrections of goals, leads, the lag of the shape."""
 
 import dataclasses
-from collections import deque
 
 import numpy as np
 import pytest
@@ -85,18 +84,6 @@ def test_the_tip_lags_by_the_law(slower):
     law_s = np.mean(spring_lag_s(policy, np.zeros(N)) @ np.ones(N))
     lag_s = tip_lag_s(Controller.of(policy, high))
     assert lag_s == pytest.approx(SPEC.control.reference_s + law_s + DT_S, rel=0.1)
-
-
-def test_what_a_plan_waits_is_part_of_the_lag():
-    kept = deque(maxlen=11)
-
-    def late(pose, goal, spring_m, sensed):
-        kept.append(goal)
-        return high(pose, kept[0], spring_m, sensed)
-
-    assert tip_lag_s(Controller.of(OF_MOTION, late)) - tip_lag_s(
-        Controller.of(OF_MOTION, high)
-    ) == pytest.approx(10 * DT_S, abs=1e-3)
 
 
 def test_the_rehearsal_tells_the_policy_of_motion_what_the_loop_tells_it():

@@ -6,10 +6,8 @@ import pytest
 from mjx_softarm.deploy.belief import stuck_springs
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import check_arm, check_number
-from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import follow
-from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.twin.arm import Twin
@@ -106,17 +104,6 @@ def test_spring_is_stuck_if_the_chamber_beside_it_is_driven():
         assert np.flatnonzero(stuck_springs(spring_m, pressure_kpa, 3)).tolist() == expected
     spring_m[:, 5] += np.linspace(0.0, 3e-3, 25)  # a spring of the same section
     assert np.flatnonzero(stuck_springs(spring_m, np.zeros((25, 18)), 3)).tolist() == [4]
-
-
-def test_record_of_other_arms(other_arm):
-    """Logs have a column for each spring and each chamber."""
-    targets_kpa = random_pressures(other_arm, 2, 0)
-    found = record(LinearArm(spec=other_arm), other_arm, 0.3 * targets_kpa)
-    assert found.n_poses == 2 and found.ending.status == 0
-    np.testing.assert_allclose(found.log.pressure_kpa, 0.3 * targets_kpa)
-    length_m = other_arm.spring_sensor.lengths(found.log.readings).length_m
-    expected_m = springs_at(other_arm, 0.3 * targets_kpa[0])
-    np.testing.assert_allclose(length_m[0], expected_m, atol=2e-4)
 
 
 def test_twin_is_led_to_a_goal(other_arm):

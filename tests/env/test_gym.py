@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from mjx_softarm.env import EnvConfig, Randomisation
+from mjx_softarm.env import EnvConfig
 from mjx_softarm.env.gym import ENV_ID, EPISODE_LENGTH, SoftArmEnv, SoftArmVectorEnv, as_sb3
 
 CONFIG = EnvConfig(engine="chain", n_poses=64)
@@ -53,15 +53,6 @@ def test_make_adds_the_time_limit_and_the_passive_checks(arm):
     assert [(terminated, truncated) for _, _, terminated, truncated, _ in steps] == [(False, False)] * (
         EPISODE_LENGTH - 1
     ) + [(False, True)]
-
-
-def test_the_space_has_what_is_observed():
-    config = EnvConfig(
-        engine="chain", n_poses=4, observation="payload", randomisation=Randomisation(payload_max_kg=1.0)
-    )
-    env = SoftArmEnv(config=config)
-    obs, _ = env.reset(seed=0)
-    assert obs.shape == (19,) and env.observation_space.contains(obs)
 
 
 def test_an_action_that_is_nan_truncates_without_a_reward_and_is_marked(arm):

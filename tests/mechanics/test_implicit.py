@@ -17,7 +17,6 @@ from tests.arms import FOUR_CHAMBERS, SHORT, SIX_CHAMBERS, TAPERED
 
 SPEC = ArmSpec.default()
 DIFFERENTIATED = {
-    "three": SPEC.replace(structure={"n_sections": 2, "links_per_section": 2}),
     "tapered": TAPERED.replace(structure={"links_per_section": 1}),
     "four": FOUR_CHAMBERS.replace(structure={"n_sections": 1, "links_per_section": 2}),
     "six": SIX_CHAMBERS.replace(structure={"n_sections": 1, "links_per_section": 2}),

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as npst
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import archive
 from mjx_softarm._support.archive import SealedFileError, sealed
-from mjx_softarm.control import Gains, allocation
+from mjx_softarm.control import allocation
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
@@ -105,17 +105,6 @@ def test_what_is_saved_is_loaded_and_has_the_same_bytes(file, make_policy):
     assert file.read_bytes() == before
     save_policy(file, make_policy(s2r=None))
     assert_same(load_policy(file), make_policy(s2r=None))
-
-
-def test_parts_are_those_of_the_arm(file):
-    policy, spec = load_policy(file), ArmSpec.default()
-    assert [weight.shape for weight, _ in policy.layers] == [(18, 7), (7, 5), (5, 9)]
-    np.testing.assert_array_equal(policy.obs_scale.centre, [0, 0, -600, 0, 0, 0])
-    np.testing.assert_array_equal(policy.obs_scale.scale, [200, 200, 200, 90, 90, 90])
-    assert (policy.reward, policy.provenance) == (RewardConfig(threshold=0.025), PROVENANCE)
-    assert (policy.gains, policy.rate_hz) == (Gains.from_spec(spec), 50.0)
-    for readings, length_m in zip(policy.actions[1:], (0.085, 0.275), strict=True):
-        np.testing.assert_allclose(policy.sensor.lengths(readings).length_m, length_m, rtol=1e-12)
 
 
 def test_file_is_plain_npz_with_named_layouts(file):

@@ -82,16 +82,3 @@ def test_it_is_written_without_the_training_model(module):
     tree = ast.parse(Path(module.__file__).read_text("utf-8"))
     imported = " ".join(ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom))
     assert imported and "mechanics" not in imported and "mujoco" not in imported
-
-
-def test_it_is_of_any_arm_as_unlike_as_the_paper_s_in_proportion():
-    """Offsets are in proportion to a section, shear and torsion to how soft it is."""
-    paper, short = (open_arm(f"twin:rod:3@{name}") for name in ("paper", "stiff-flop"))
-    assert (paper.read_sensors() != open_arm("twin:rod:4").read_sensors()).all()
-    np.testing.assert_array_equal(paper._base_m, open_arm("twin:rod:3")._base_m)
-    np.testing.assert_allclose(short._base_m, 0.055 / 0.2 * paper._base_m)
-    share = short._rod.parts.bending / short._rod.parts.torsion
-    np.testing.assert_allclose(share, paper._rod.parts.bending / paper._rod.parts.torsion, rtol=1e-6)
-    assert open_arm("twin:rod:0@sopra").read_sensors().shape == (6,)
-    with pytest.raises(InputError, match="nobody: got no such arm"):
-        open_arm("twin:rod:0@nobody")

@@ -1,12 +1,9 @@
 """Logs replayed and shared, without a browser."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.logs.schema import write_log
 from tests.linear_arm import GOALS, SPEC, LinearArm, go
 
@@ -28,17 +25,6 @@ def test_track_shows_the_row_of_a_time(path):
     assert track.at(-1.0).time_s == 0.0 and track.at(1e9).time_s == pytest.approx(1.98)
     assert track.at(0.51).time_s == pytest.approx(0.50)
     np.testing.assert_allclose(track.at(1.0).goal, GOALS[0], atol=1e-4)
-
-
-def test_the_path_that_is_asked_for_is_drawn(path, tmp_path, server, monkeypatch):
-    angle = np.linspace(0.0, 2 * np.pi, 50)
-    circle = np.tile(GOALS[0], (50, 1)) + 80.0 * np.stack([np.cos(angle), np.sin(angle)] + [0 * angle] * 4, 1)
-    log = read_matrix(path, SPEC)[0].log()
-    rows = np.arange(len(log)) // 2 % 50
-    write_log(tmp_path / "circle.csv", replace(log, goal=circle[rows]))
-    track = Timeline(tmp_path / "circle.csv", SPEC)
-    drawn = ReplayPage(server, SPEC, [track])._stages[0]._asked
-    assert drawn.visible and np.ptp(drawn.points, axis=0) == pytest.approx([0.16, 0.16, 0.0], abs=2e-3)
 
 
 def test_track_goes_without_rows_out_of_order(path, tmp_path):

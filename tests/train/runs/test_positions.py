@@ -69,8 +69,3 @@ def test_positions_with_saturation_or_a_body_outside_are_counted():
     figures, at = summarise(reached, 0.03, np.ones(4, bool))
     assert (figures.saturated_positions, figures.outside_positions, figures.unsettled) == (1, 1, 1)
     assert figures.success == (True, False, False, False) == tuple(at.success)
-
-
-def test_an_evaluation_at_rest_corrects_positions(short_env, evaluator, shift_limit):
-    found = evaluator(short_env).on(short_env, 1, shift_limit)(0.0)[1]
-    assert (found.reached.near_s == shift_limit[0]).all()
