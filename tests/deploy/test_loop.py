@@ -13,7 +13,6 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import MISSED, Ending
 from mjx_softarm.deploy.goals import on_the_way
-from mjx_softarm.deploy.loop import start, step, with_goal
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.deploy.strategy import N_CORRECTIONS
@@ -169,18 +168,6 @@ def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
     lasted = [rows.stop - rows.start for rows in run.ways]
     np.testing.assert_allclose(lasted, [150, 100], atol=1)
     np.testing.assert_allclose(run.log.goal[run.ways[1]][50], goals[4], atol=1e-6)
-
-
-def test_state_is_not_changed_in_place():
-    state, _ = with_goal(CONTROLLER, start(CONTROLLER), GOALS[0])
-    held = state.command.law.integral_kpa, state.belief.n_lost, state.belief.window.spring_m
-    arrays = [np.array(value, copy=True) for value in held]
-    readings = LinearArm().read_sensors()
-    first = step(CONTROLLER, state, readings, False)[0]
-    second = step(CONTROLLER, state, readings, False)[0]
-    np.testing.assert_array_equal(first.command.pressure_kpa, second.command.pressure_kpa)
-    for before, after in zip(arrays, held, strict=True):
-        np.testing.assert_array_equal(before, after)
 
 
 def test_log_has_pressures_in_force_and_calibration_reads_it(tmp_path):
