@@ -45,7 +45,7 @@ def changed(env, **config):
 @pytest.mark.parametrize("pipe_mm", [None, 130.0], ids=["open", "narrower than the arm"])
 def test_positions_are_evaluated_with_body_and_pressures(short_env, evaluator, shown, pipe_mm):
     n = len(shown.positions)
-    figures, at = evaluator(changed(short_env, pipe_diameter_mm=pipe_mm))(0.0)
+    figures, at = evaluator(short_env).on(changed(short_env, pipe_diameter_mm=pipe_mm), 4)(0.0)
     assert figures.reached_share == 1.0 and figures.max_mm < 0.05 and len(figures.error_mm) == n
     assert (
         figures.success_share == (pipe_mm is None) and figures.outside_positions == (pipe_mm is not None) * n
