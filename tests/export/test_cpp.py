@@ -16,6 +16,7 @@ from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import FLAGS, Machine
 from mjx_softarm.mdp.observation import OBS_SIZE
+from tests.arms import SIX_CHAMBERS, TAPERED
 from tests.export.conftest import (
     busy_policy,
     carrying_policy,
@@ -63,13 +64,17 @@ def agreeing_rows(policy, folder, run_ticks):
     return golden
 
 
-def test_rows_of_other_arms_agree(tmp_path, other_arm):
-    """Redundant chambers share the law's allocation; sections differ."""
-    agreeing_rows(busy_policy(other_arm), tmp_path, run_ticks=100)
-
-
-def test_rows_of_draw_wires_agree(tmp_path):
-    agreeing_rows(draw_wire_policy(), tmp_path, run_ticks=30)
+@pytest.mark.parametrize(
+    ("make", "run_ticks"),
+    [
+        (lambda: busy_policy(SIX_CHAMBERS), 100),  # redundant chambers share the law's allocation
+        (lambda: busy_policy(TAPERED), 100),  # sections differ
+        (draw_wire_policy, 30),
+    ],
+    ids=["six", "tapered", "draw wires"],
+)
+def test_rows_of_other_arms_agree(tmp_path, make, run_ticks):
+    agreeing_rows(make(), tmp_path, run_ticks)
 
 
 def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):
