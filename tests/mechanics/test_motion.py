@@ -117,14 +117,14 @@ def mover(spec, engine=midpoint, step_s=PERIOD_S, longest_delay_s=0.0):
     return lambda *args, params=nominal: many(*args, params)
 
 
-@pytest.mark.parametrize("links", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("links", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_transients_of_both_engines_are_those_of_c_mujoco(links):
-    """Within 1 mm at 95 % over 2 s, with a random reference each half second."""
+    """Within 1 mm at 95 % over 1 s, with a random reference each half second."""
     spec = SPEC.replace(structure={"links_per_section": links})
-    n_arms = 2 * links  # 4, and 8 in the slow test
-    start, asked = starts(spec, n_arms), references(spec, n_arms)
+    n_arms = 4 + links
+    start, asked = starts(spec, n_arms), references(spec, n_arms)[:, : 2 * HOLD_TICKS]
     true = np.array([true_tips(spec, *each) for each in zip(*start, asked, strict=True)])
-    assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 200.0  # mm on the way
+    assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 150.0  # mm on the way
 
     def tips(engine, step_s):
         moved = mover(spec, engine, step_s)(*start, np.float32(asked), MotionParams())
