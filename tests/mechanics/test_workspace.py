@@ -155,6 +155,11 @@ def test_the_outline_of_a_notched_square_keeps_the_notch():
     assert np.linalg.norm(filled[:, 0] - filled[:, 1], axis=1).sum() == pytest.approx(4 * 10)
 
 
+@pytest.mark.parametrize("points", [np.zeros((2, 2)), np.stack([np.arange(5.0)] * 2, axis=1)])
+def test_points_on_a_line_have_no_outline(points):
+    assert outline(points, gap=1.0).shape == (0, 2, 2)
+
+
 def run(*arguments):
     """Exit code, and what was printed and complained about."""
     out, err = io.StringIO(), io.StringIO()

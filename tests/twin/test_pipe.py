@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.drivers.names import open_arm
+from mjx_softarm.mechanics.drawing.render import RenderError
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance, clearance
@@ -206,3 +207,15 @@ def test_arms_in_pipes_by_name():
     assert open_arm("twin:7:pipe300").wall_force_n() == (0.0, 0.0)
     # Floors of 200 mm would have no width, and MuJoCo compiles none on some twins
     assert all(open_arm(f"twin:{seed}:pipe200").wall_force_n() == (0.0, 0.0) for seed in (1, 4))
+
+
+def test_picture_shows_what_the_arm_holds_in_the_pipe():
+    arm = Twin(0, build=Build(gap=0.0), pipe=PIPE)
+    try:
+        with arm.renderer(140, 180) as renderer:
+            hanging = arm.draw(renderer).astype(int)
+            arm.attach(0.22)
+            holding = arm.draw(renderer).astype(int)
+    except RenderError as error:
+        pytest.skip(str(error))
+    assert 10 < (np.abs(holding - hanging).max(axis=-1) > 40).sum() < 400  # the ball alone
