@@ -73,18 +73,6 @@ class LoadedArm(LinearArm):
         return super().spring_m + STRETCH_M_PER_KG * self.payload_kg
 
 
-class Weak(LoadedArm):
-    """Regulators that hold 1 kPa too little."""
-
-    def holds(self, pressure_kpa):
-        return pressure_kpa - 1.0
-
-
-class Honest(Weak):
-    def pressures(self):
-        return self.actual_kpa
-
-
 @pytest.mark.parametrize("payload_kg", [0.0, 0.6])
 def test_payload_is_estimated_at_rest_and_believed_in_the_pose(payload_kg):
     run = follow(LoadedArm(payload_kg))
@@ -243,14 +231,6 @@ def test_a_fault_of_the_payload_is_told_once_until_the_payload_changes():
     run = follow(arm, goals=goals, tell=lines.append, arrived=next_load)
     told = [line for line in lines if "load unknown" in line]
     assert len(told) == 2 and run.counts()[Fault.LOAD_UNKNOWN] > 6 and len(run.arrivals) == 3
-
-
-def test_measured_pressures_tell_more_than_those_in_force():
-    lines, blind = [], []
-    seen, unseen = follow(Honest(0.5), tell=lines.append), follow(Weak(0.5), tell=blind.append)
-    assert seen.log.load_kg[-1] == pytest.approx(0.5, abs=0.03)
-    assert unseen.log.load_kg[-1] < 0.35
-    assert "commanded pressures" in blind[0] and not any("commanded" in line for line in lines)
 
 
 def test_pressure_that_is_not_measured_is_the_one_in_force():

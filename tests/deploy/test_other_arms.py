@@ -44,23 +44,6 @@ def test_goal_is_reached_and_no_pressure_is_spent_in_vain(other_arm):
     np.testing.assert_array_equal(arm.written[-1], 0.0)
 
 
-def test_the_chamber_that_keeps_an_arm_from_rest_is_named():
-    """References beside any plane, in the first section, are held as well as a plane can."""
-
-    class Swinging(LinearArm):
-        @property
-        def spring_m(self):
-            swing_m = 2e-3 * np.sin(2 * np.pi * 0.7 * self.time_s)
-            return super().spring_m + np.where(np.arange(12) == 6, swing_m, 0.0)
-
-    beside_m = 8e-3 * np.append([1.0, -1.0, 1.0, -1.0], np.zeros(8))
-    controller = controller_of(FOUR_CHAMBERS, springs_at(FOUR_CHAMBERS, np.full(12, -5.0)) + beside_m)
-    goal = np.asarray(estimate(controller.policy.estimator, np.full(12, 0.2), 0.0), float)
-    run = follow(Swinging(spec=FOUR_CHAMBERS), controller, [goal], duration_s=20.0)
-    told = [event.message for event in run.events if event.fault is Fault.NOT_SETTLED]
-    assert told and all(", chamber6 is " in text for text in told)
-
-
 def test_lost_chamber_is_told_from_the_springs(other_arm):
     """Its section cannot hold the references, even where others take over what they can."""
     pressure_kpa = np.zeros(other_arm.n_chambers)

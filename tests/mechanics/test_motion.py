@@ -161,28 +161,6 @@ def test_the_inertia_is_that_of_c_mujoco():
         np.testing.assert_allclose(found_bias, data.qfrc_bias, atol=1e-5 * np.abs(data.qfrc_bias).max())
 
 
-def test_arms_in_chunks_move_as_each_does_alone():
-    """Two of five at once, the last chunk filled up; their gradients, too."""
-    start, asked = starts(SHORT, 5), np.float32(references(SHORT, 5))[:, 0]
-    model, data = put(build_model(SHORT))
-    nominal = jax.tree.map(jnp.asarray, ArmParams.from_spec(SHORT))
-
-    def height(q, pressure_kpa, reference_m, friction_n, n_at_once=None):
-        arm = MovingArm(model, data, nominal, MotionParams(friction_n=friction_n))
-        _, springs = chambers_and_springs(all_tendons(chain_kinematics(nominal)(q), nominal), nominal)
-        motion = Motion.at_rest(q, pressure_kpa, springs.length)
-        times_s = 3 * PERIOD_S, PERIOD_S, PERIOD_S
-        end = midpoint.advance(arm, motion, reference_m, GAINS, *times_s, n_at_once)[1]
-        return end.tip_position_m[0], end
-
-    slope = jax.value_and_grad(height, argnums=(0, 2), has_aux=True)
-    arguments = *start, asked, np.float32(np.arange(5))
-    chunks = jax.jit(jax.vmap(lambda *x: slope(*x, n_at_once=2)))(*arguments)
-    alone = jax.jit(lambda *x: jax.lax.map(lambda row: slope(*row), x))(*arguments)
-    for found, expected in zip(*map(jax.tree.leaves, (chunks, alone)), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
-
-
 @pytest.fixture(scope="module")
 def short():
     """Four small arms, references that change each half second, and the function that moves them."""

@@ -133,14 +133,6 @@ def test_other_arms_and_observations_are_kept(tmp_path, make_arm_model, spec, ob
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("names", [["hidden_0"], ["hidden_1", "head"], ["hidden_0", "head", "norm_0"], []])
-def test_parameters_of_another_network_are_refused(names, make_arm_model):
-    dense, model = make_params()["params"]["hidden_0"], make_arm_model(ArmSpec.default())
-    params = {"params": dict.fromkeys(names, dense)}
-    with pytest.raises(ValueError, match=r"expected hidden_0, hidden_1, \.\.\. and head"):
-        policy_from_actor(params, ArmSpec.default(), RewardConfig(), model, {})
-
-
 def test_networks_of_another_arm_are_refused(make_arm_model):
     spec = ArmSpec.default()
     model, another = make_arm_model(spec, s2r=True), make_arm_model(TWO_SECTIONS, s2r=True)

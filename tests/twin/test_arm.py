@@ -128,14 +128,6 @@ def test_tolerances_reach_the_compiled_model(spec):
     np.testing.assert_allclose(parts.base_rotation @ model.opt.gravity, [0, 0, -9.81], atol=1e-12)
 
 
-def test_markers_run_from_the_base_to_the_tip(noiseless):
-    capture = noiseless.motion_capture()
-    assert capture.marker_m.shape == (9, 3)
-    np.testing.assert_allclose(capture.marker_m[-1], capture.tip_m, atol=1e-12)
-    step_m = np.linalg.norm(np.diff(capture.marker_m, axis=0), axis=1)
-    assert step_m.min() > 0.02 and step_m.max() < 0.12
-
-
 def test_closed_loop_in_pressure_dissipates():
     """Work of the air over a closed loop: little in a nearly undamped arm, much with losses."""
     work_j = []

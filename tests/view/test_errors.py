@@ -10,7 +10,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
-from mjx_softarm.view.errors import SCALE, SCALE_MM, Errors, colours
+from mjx_softarm.view.errors import Errors
 
 SPEC = ArmSpec.default()
 
@@ -42,11 +42,6 @@ def test_sets_come_back_and_others_are_refused(tmp_path):
     write_pose_pairs(tmp_path, {"goals": pairs(1.0)._replace(warned=np.zeros(3, bool))})
     with pytest.raises(InputError, match=r"goals: got shapes .*, expected \(n, 6\)"):
         read_pose_pairs(tmp_path)
-
-
-def test_colours_stand_for_errors():
-    np.testing.assert_array_equal(colours(SCALE_MM), SCALE)
-    np.testing.assert_array_equal(colours(np.array([0.0, 500.0])), SCALE[[0, -1]])
 
 
 def test_run_is_followed_from_before_its_first_evaluation(server, run):
