@@ -81,7 +81,9 @@ def test_payloads_go_up_to_the_arm_s_largest_where_they_are_observed(spec):
 
 def test_a_payload_is_observed_as_it_is_from_start_to_end(spec, quick_compiler):
     short_arm = spec.replace(structure={"n_sections": 1, "links_per_section": 2})
-    env = ReachEnv(short_arm, EnvConfig(n_poses=64, observation="payload", randomisation=SPREAD))
+    env = ReachEnv(
+        short_arm, EnvConfig(engine="chain", n_poses=64, observation="payload", randomisation=SPREAD)
+    )
     start = xla.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
     actions = jax.random.uniform(jax.random.key(1), (64, env.action_size), minval=-1.0)
     after = xla.jit(jax.vmap(env.step))(start, actions)

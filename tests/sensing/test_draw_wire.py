@@ -49,7 +49,8 @@ def test_voltages_are_lengths_by_scale_and_calibration():
 
 
 def test_actions_are_voltages_and_lead_where_they_say(quick_compiler):
-    env = ReachEnv(SPEC.replace(structure={"n_sections": 1, "links_per_section": 2}), EnvConfig(n_poses=16))
+    short = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
+    env = ReachEnv(short, EnvConfig(engine="chain", n_poses=16))
     shortest_v, middle_v, longest_v = 0.085 / 0.2, 0.18 / 0.2, 0.275 / 0.2  # beta is 1, delta 0
     expected = np.outer([shortest_v, middle_v, longest_v], np.ones(3))
     np.testing.assert_allclose(env.action_map.readings(np.linspace(-1, 1, 3)[:, None]), expected, rtol=1e-6)
