@@ -1,7 +1,6 @@
 """Options of the compiler: those that the installed jaxlib accepts, wherever they are asked for."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -30,31 +29,3 @@ def test_options_can_be_asked_for_while_a_function_is_traced():
 
     assert jax.jit(traced)(np.float32(3.0)) == 6.0
     assert inside == [outside]
-
-
-def test_a_helper_is_traced_once_in_a_program_and_in_its_gradients():
-    """A rule of a derivative, a loop and a plain call share the trace; by `jax.jit` alone they do not."""
-    traces = []
-
-    @jax.jit
-    def helper(x):
-        traces.append(x)
-        return jnp.sin(x)
-
-    @jax.custom_jvp
-    def ruled(x):
-        return helper(x)
-
-    @ruled.defjvp
-    def rule(primals, tangents):
-        (x,), (dx,) = primals, tangents
-        return helper(x), helper(x) * dx
-
-    def program(x):
-        _, many = jax.lax.scan(lambda carry, _: (helper(carry), carry), x, None, length=3)
-        return helper(x) + jax.grad(ruled)(x) + jnp.sum(many)
-
-    found = xla.jit(program)(jnp.float32(0.5))
-    assert len(traces) == 1
-    traces.clear()
-    assert jax.jit(lambda x: program(x))(jnp.float32(0.5)) == pytest.approx(float(found))

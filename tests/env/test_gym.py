@@ -1,7 +1,5 @@
 """The Gymnasium environments against Gymnasium's own checks, its own vector environment, and SB3."""
 
-import dataclasses
-
 import gymnasium
 import numpy as np
 import pytest
@@ -147,18 +145,6 @@ def test_an_arm_at_its_goal_terminates_and_the_others_go_on(envs):
     assert not truncated.any()
     np.testing.assert_array_equal(infos["_final_obs"], terminated)
     np.testing.assert_array_equal(infos["_tip_error_mm"], ~terminated)
-
-
-def test_a_goal_that_does_not_end_the_episode_does_not_terminate(envs):
-    """One arm, goal and action with both settings of `goal_ends`."""
-    ends = {}
-    for goal_ends in (True, False):
-        env = SoftArmEnv(config=dataclasses.replace(CONFIG, goal_ends=goal_ends))
-        _, info = env.reset(seed=6)
-        action = to_goals(envs.env, info["goal"][None])[0]
-        _, _, ends[goal_ends], truncated, info = env.step(action)
-        assert info["is_success"] and not truncated
-    assert ends == {True: True, False: False}
 
 
 def test_an_arm_that_cannot_settle_is_reset_and_marked_while_the_others_go_on(envs):
