@@ -1,8 +1,9 @@
-"""Arms besides the paper's: four chambers a section, six chambers with three springs, tapered sections."""
+"""Arms besides the paper's: short, of four and of six chambers a section, and of tapered sections."""
 
 from mjx_softarm import ArmSpec
 
 _PAPER = ArmSpec.default()
+SHORT = _PAPER.replace(structure={"n_sections": 1, "links_per_section": 2})  # compiles in seconds
 
 
 def _chambers(share):

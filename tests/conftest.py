@@ -16,7 +16,7 @@ from mjx_softarm.policy.file import ArmModel
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
 from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
-from tests.arms import FOUR_CHAMBERS, OTHER_ARMS, SIX_CHAMBERS, TAPERED
+from tests.arms import FOUR_CHAMBERS, OTHER_ARMS
 from tests.networks import s2r_of
 
 jax.config.update("jax_num_cpu_devices", 8)  # most tests use one of them
@@ -53,18 +53,6 @@ def spec():
 def four_chamber_arm():
     """Four chambers a section, a spring beside each."""
     return FOUR_CHAMBERS
-
-
-@pytest.fixture(scope="session")
-def six_chamber_arm():
-    """Six chambers a section, a spring beside every second one."""
-    return SIX_CHAMBERS
-
-
-@pytest.fixture(scope="session")
-def tapered_arm():
-    """Three chambers a section; sections that differ in length, radii, angle, mass and stiffness."""
-    return TAPERED
 
 
 @pytest.fixture(scope="session", params=OTHER_ARMS)

@@ -88,33 +88,25 @@ BESIDE = "with geometry.section_length_m 0.2, expected lengths that go together"
 REFUSED = [
     # field, value, what follows the field in the message
     ("mass.gripper_length_m", "heavy", f"got 'heavy', expected {NOT_MM}"),
-    ("mass.gripper_length_m", True, f"got True, expected {NOT_MM}"),
     ("mass.gripper_length_m", 0.0, f"got 0.0, expected {NOT_MM}"),
     ("mass.gripper_length_m", 10**400, f"got {10**400}, expected {NOT_MM}"),
     ("backbone.axial_stiffness_n_per_m", math.nan, f"got nan, expected a number > 0{SECTIONS}"),
     ("backbone.axial_stiffness_n_per_m", 1e39, "got 1e+39, expected sizes from 1.2e-38 to 3.4e+38"),
-    ("mass.gripper_kg", 300.0, "got 300.0, expected a number >= 0 and <= 50 (kg, not g)"),
     ("geometry.section_length_m", 200.0, f"got 200.0, expected {NOT_MM}{SECTIONS}"),
     ("structure.n_sections", 3.0, "got 3.0, expected a whole number >= 1 and <= 100"),
     ("structure.chambers_per_section", 2, "got 2, expected a whole number >= 3 (fewer bend a section"),
-    ("structure.springs_per_section", 2, "got 2, expected 0 for one beside each chamber, or 3 or more"),
     ("mounting.base_turn_deg", [1.0], "got [1.0], expected a list of 3 numbers"),
     ("chambers.pressure_min_kpa", -102.0, "got -102.0, expected a number >= -101.325 and <= 2000 (kPa"),
     ("chambers.pressure_min_kpa", 20.0, "got 20.0, expected less than pressure_max_kpa (20.0)"),
-    ("chambers.length_offset_m", 0.2, "got 0.2, expected a number >= -0.1 and <= 0.1, or a list with one"),
     ("chambers.bonded_share", 0.96, "got 0.96, expected a number >= -0.3 and <= 0.95"),
     ("springs.length_min_m", 0.275, "got 0.275, expected less than length_max_m (0.275)"),
-    ("springs.rest_length_m", 0.02, f"got 0.02 {BESIDE}"),
     ("springs.rest_length_m", 0.7, f"got 0.7 {BESIDE}"),
     ("sensor.beta", [0.93] * 8, "got 8 numbers, expected one, or one for each of the 9 springs"),
     ("sensor.beta", [0.93] * 8 + [math.nan], "[8]: got nan, expected a number > 0, or a list with one"),
     ("sensor.kind", "laser", "got 'laser', expected coil or draw_wire"),
-    ("sensor.compensation_h", -1.0e-5, "springs.length_min_m: got 0.085, which reads"),
-    ("sensor.frequency_max_hz", 3.0e6, "springs.length_max_m: got 0.275, which reads"),
     ("sensor.delta_m", 0.09, "springs.length_min_m: got 0.085, which reads"),
     ("name", {"first": "arm"}, "got {'first': 'arm'}, expected a text"),
     ("mass", 4.7, "got 4.7, expected a table"),
-    ("motors", {}, "got an unknown field, expected name, structure,"),
     ("control.kd", 1.0, "got an unknown field, expected rate_hz, kp_kpa_per_m,"),
 ]
 
@@ -126,7 +118,7 @@ def test_a_refused_value_is_named_with_file_field_and_expectation(data, path, va
     assert text.startswith(f"my.toml: {field}{expected}")
 
 
-@pytest.mark.parametrize("path", ["mass.arm_kg", "sensor", "name"])
+@pytest.mark.parametrize("path", ["mass.arm_kg", "sensor"])
 def test_a_missing_field_is_named(data, path):
     *groups, name = path.split(".")
     del (data[groups[0]] if groups else data)[name]

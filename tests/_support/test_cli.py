@@ -24,10 +24,6 @@ class Inner:
     """discount"""
     widths: tuple[int, ...] = (2, 3)
 
-    def __post_init__(self):
-        if self.gamma > 1.0:
-            raise ValueError(f"Inner.gamma: got {self.gamma}, expected at most 1")
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -114,37 +110,25 @@ def test_functions_of_two_words_get_lists_and_flags():
     [
         ("make --inner.gama 1", "--inner.gama, 1|--inner.gamma FLOAT"),
         ("make --n one", "--n: |'one'|--n INT"),
-        ("make --n", "'--n'|Expected 1 values"),
         ("make --limit low", "--limit: |'low'|{None}|FLOAT"),
         ("make --preset huge", "'--preset'|'huge'|Expected one of ('small', 'large')"),
-        ("make --inner.gamma 2", "Inner.gamma: got 2.0, expected at most 1"),
         ("make more", "Unrecognized options: more"),
         ("show files --seeds 0,a", "--seeds: got '0,a', expected whole numbers|N,N,..."),
         ("fail", "Missing from program fail:|--how {bug,input,file,gone,interrupt}"),
+        ("dance", "error: program: got 'dance', expected one of make, show files, fail, late"),
+        ("show dance", "error: program show: got 'dance', expected one of files"),
+        ("make --n 0", "error: n: got 0, expected at least 1"),
+        ("fail --how input", "error: x: got 1, expected 2"),
+        ("fail --how file", "error: absent/file: got 'No such file or directory', expected a file"),
+        ("fail --how gone", "error: [Errno 32] gone"),  # of an arm's connection, not of the output
     ],
 )
-def test_a_bad_option_is_told_with_what_it_may_be(words, told, capsys, monkeypatch):
+def test_a_mistake_is_told_with_what_it_may_be_and_status_2(words, told, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # no message is broken into lines
     assert run(*words.split()) == 2 and RESULTS == []
     out, err = capsys.readouterr()
     assert out == "" and all(part in err for part in told.split("|"))
-
-
-@pytest.mark.parametrize(
-    "words, message",
-    [
-        ("dance", "program: got 'dance', expected one of make, show files, fail, late"),
-        ("show dance", "program show: got 'dance', expected one of files"),
-        ("make --n 0", "n: got 0, expected at least 1"),
-        ("fail --how input", "x: got 1, expected 2"),
-        ("fail --how file", "absent/file: got 'No such file or directory', expected a file"),
-        ("fail --how gone", "[Errno 32] gone"),  # of an arm's connection, not of the output
-    ],
-)
-def test_a_mistake_is_one_line_and_status_2(words, message, capsys):
-    assert run(*words.split()) == 2 and RESULTS == []
-    out, err = capsys.readouterr()
-    assert out == "" and err.startswith(f"error: {message}") and err.count("\n") == 1
+    assert not told.startswith("error") or err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -177,21 +161,19 @@ sys.exit(cli.main("program", "About it.", {"many": many, "at once": at_once}))
 """
 
 
-@pytest.mark.parametrize("together", [False, True])
 @pytest.mark.parametrize(
-    "words", ["", "many --help", "many --n 10", "many --n 90000", "at once --n 2", "many --n one"]
+    "words, together, status",
+    [("many --help", False, 141), ("many --n 90000", True, 141), ("at once --n 2", False, 141)]
+    + [("many --n one", True, 141), ("many --n one", False, 2)],
 )
-def test_a_command_whose_output_is_not_read_ends_quietly(words, together):
+def test_a_command_whose_output_is_not_read_ends_quietly(words, together, status):
     """The reader has ended before the first line, on both streams where they go one way."""
     unread, output = os.pipe()
     os.close(unread)
     errors = output if together else subprocess.PIPE
     ended = subprocess.run([sys.executable, "-c", PRINTS, *words.split()], stdout=output, stderr=errors)
     os.close(output)
-    if words.endswith("one") and not together:
-        assert ended.returncode == 2 and b"INT" in ended.stderr
-    else:
-        assert ended.returncode == 141 and not ended.stderr
+    assert ended.returncode == status and bool(ended.stderr) == (status == 2)
 
 
 def test_a_bug_is_not_taken_for_a_mistake_of_the_user():

@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_softarm._support.mlp import mlp
-from mjx_softarm._support.training import Schedule, initial_layers, train_network
+from mjx_softarm._support.training import Schedule, train_network
 
 TRUE = np.array([1.0, -2.0, 0.5], np.float32)
 SCHEDULE = Schedule(n_updates=400, learning_rate=0.1, batch_size=20)
@@ -47,16 +46,3 @@ def test_the_seed_decides_and_decay_holds_weights_back():
     assert not np.array_equal(first, other)
     held_back, _ = train(rows, SCHEDULE._replace(weight_decay=3.0))
     assert np.linalg.norm(held_back) < 0.9 * np.linalg.norm(TRUE)
-
-
-def test_fewer_rows_than_a_batch_are_one_batch():
-    weights, losses = train(regression(15), Schedule(300, 0.1, 64))
-    assert len(losses) == 300
-    np.testing.assert_allclose(weights, TRUE, atol=0.05)
-
-
-def test_initial_layers_keep_the_magnitude_of_their_input():
-    layers = initial_layers(jax.random.key(0), (64, 256, 256, 64))
-    assert [w.shape for w, _ in layers] == [(64, 256), (256, 256), (256, 64)]
-    x = np.random.default_rng(0).normal(size=(200, 64)).astype(np.float32)
-    assert 0.5 < np.std(mlp(layers, x)) / np.std(x) < 2.5

@@ -11,7 +11,7 @@ import pytest
 from calib.read.logs import read_log
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.drivers.names import open_arm, twin_spec
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.spec import ArmSpec
 from tests.linear_arm import FAR, GOALS, POLICY, REST_M, SENSOR, LinearArm, N
@@ -25,11 +25,9 @@ MISSED = "--goal=" + ",".join(map(str, GOALS[0]))
     ("name", "message"),
     [
         ("twin", "got 'twin', expected twin:SEED, wiring.toml or package.module:Class"),
-        ("twin:-1", "got '-1', expected an integer >= 0"),
         ("twin:0:pipe220", "twin:0:PIPE: got 'pipe220', expected one of pipe300, pipe250, "),
         ("twin:0:500", "twin:0:PIPE: got '500', expected one of .*pipe250, pipe200, or grams, 500g"),
         ("twin:rod:0@", "twin:rod:SEED@ARM: got no arm, expected one as for --spec"),
-        ("twin:0:500g:pipe300", "twin:0:PIPE: got '500g:pipe300', expected"),
         ("no_such_module:Arm", "no_such_module:Arm: got No module named 'no_such_module', expected a module"),
         (
             "mjx_softarm.deploy.loop:Nothing",
@@ -158,20 +156,7 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
 
 
 @pytest.mark.parametrize(
-    ("name", "spec"),
-    [
-        ("twin:7", None),
-        ("twin:7@my/arm.toml", "my/arm.toml"),
-        ("twin:rod:7@sopra:aged:500g", "sopra"),
-        ("module:Arm", None),
-    ],
-)
-def test_a_twin_names_its_own_arm(name, spec):
-    assert twin_spec(name) == (spec and Path(spec))
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "line"),
+    ("words", "status", "lines"),
     [
         ("record --arm twin:7@wide.toml --out a.csv --poses 1", 0, "arm: wide, 9 chambers, -40 to 15 kPa\n"),
         (
@@ -181,12 +166,15 @@ def test_a_twin_names_its_own_arm(name, spec):
         ),
         (f"run policy.npz --arm its:Arm {FAR_AWAY}", 1, "goal outside the workspace"),
         (f"run --arm its:Arm {FAR_AWAY}", 1, "policy: the package's own"),
-        (f"run policy.npz --arm its:Arm {MISSED}", 1, " NOT REACHED, "),
-        (f"run policy.npz --arm its:Arm {MISSED}", 1, "reached within 5.4 mm if the rotation is exact"),
-        (f"run policy.npz --arm its:Arm {MISSED}", 1, "the policy is not calibrated: it is expected to miss"),
+        (
+            f"run policy.npz --arm its:Arm {MISSED}",
+            1,
+            " NOT REACHED, |reached within 5.4 mm if the rotation is exact"
+            "|the policy is not calibrated: it is expected to miss",
+        ),
     ],
 )
-def test_lines_of_commands(words, status, line, tmp_path, monkeypatch, capsys):
+def test_lines_of_commands(words, status, lines, tmp_path, monkeypatch, capsys):
     chambers, geometry = {"pressure_max_kpa": 15.0}, {"chamber_radius_m": 0.04}
     wide = ArmSpec.default().replace(name="wide", chambers=chambers, geometry=geometry)
     wide.to_toml(tmp_path / "wide.toml")
@@ -194,7 +182,8 @@ def test_lines_of_commands(words, status, line, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: LinearArm())
     assert main(words.split()) == status
-    assert line in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert all(line in printed for line in lines.split("|"))
 
 
 @pytest.mark.parametrize(

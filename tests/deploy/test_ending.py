@@ -216,12 +216,6 @@ def test_venting_is_tried_again(error):
     assert len(saved[0]) == len(log) == n_ticks and dead.n_of["write_pressures"] == n_ticks + 2 + VENT_TRIES
 
 
-def test_first_write_that_fails_is_followed_by_zeros():
-    arm = Faulty(raises(OSError("half of it was sent")), "write_pressures", (0,))
-    assert drive("run", arm)[0].status == 3
-    np.testing.assert_array_equal(arm.arm.written, np.zeros((1, N)))
-
-
 def test_what_tell_and_arrived_raise_vents():
     def full(_):
         raise OSError("no space left on device")

@@ -13,7 +13,6 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import MISSED, Ending
 from mjx_softarm.deploy.goals import on_the_way
-from mjx_softarm.deploy.loop import start, step, with_goal
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.deploy.strategy import N_CORRECTIONS
@@ -29,7 +28,6 @@ from tests.linear_arm import (
     GOALS,
     NOISE_M,
     POLICY,
-    SENSOR,
     SPEC,
     SPRINGS_M,
     LinearArm,
@@ -106,13 +104,6 @@ def test_a_way_with_a_goal_out_of_reach_is_not_begun():
     np.testing.assert_array_equal(arm.written, 0.0)
 
 
-@pytest.mark.parametrize("goals", [[FAR, GOALS[0]], [GOALS[0], FAR]])
-def test_a_way_ends_at_a_stop_that_only_the_loop_refuses(goals, monkeypatch):
-    monkeypatch.setattr("mjx_softarm.deploy.session.refusals", lambda policy, goals: {})
-    run = trace(LinearArm(), CONTROLLER, np.array(goals), pace_s=1.0)
-    assert run.ending == Ending() and run.status == MISSED and run.counts() == {Fault.GOAL_OUTSIDE: 1}
-
-
 def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     run = trace(arm, Controller.of(POLICY, between), goals, pace_s=10.0)
@@ -142,16 +133,6 @@ def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower, uncor
     behind_m = np.abs(read_m(run.log)[rows] - due_m)
     asked_m = np.abs(run.log.reference_m[rows] - due_m)
     assert behind_m.max() < 2e-4 < 1e-3 < asked_m.max()
-
-
-def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():
-    spec = SPEC.replace(
-        control={"ki_kpa_per_ms": SPEC.control.ki_kpa_per_ms / 10.0}, geometry={"spring_radius_m": 0.0335}
-    )
-    slow = Controller.of(dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec)))
-    assert slow.window > 1.5 * CONTROLLER.window
-    assert slow.rest.still_m == pytest.approx(0.5 * CONTROLLER.rest.still_m) == 1e-4
-    assert slow.rest.arrived_m == pytest.approx(0.5 * CONTROLLER.rest.arrived_m) == 1.25e-4
 
 
 def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag(uncorrected, monkeypatch):
@@ -187,25 +168,6 @@ def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
     lasted = [rows.stop - rows.start for rows in run.ways]
     np.testing.assert_allclose(lasted, [150, 100], atol=1)
     np.testing.assert_allclose(run.log.goal[run.ways[1]][50], goals[4], atol=1e-6)
-
-
-def test_policy_itself_plans_by_default():
-    run = go(LinearArm(), goals=GOALS[:1], controller=Controller.of(POLICY), duration_s=0.1)
-    middle_hz = np.mean(POLICY.actions[1:], axis=0)  # the actor's weights are zero
-    got_hz = SENSOR.readings(run.log.reference_m[1])
-    np.testing.assert_allclose(got_hz, middle_hz, rtol=1e-6)
-
-
-def test_state_is_not_changed_in_place():
-    state, _ = with_goal(CONTROLLER, start(CONTROLLER), GOALS[0])
-    held = state.command.law.integral_kpa, state.belief.n_lost, state.belief.window.spring_m
-    arrays = [np.array(value, copy=True) for value in held]
-    readings = LinearArm().read_sensors()
-    first = step(CONTROLLER, state, readings, False)[0]
-    second = step(CONTROLLER, state, readings, False)[0]
-    np.testing.assert_array_equal(first.command.pressure_kpa, second.command.pressure_kpa)
-    for before, after in zip(arrays, held, strict=True):
-        np.testing.assert_array_equal(before, after)
 
 
 def test_log_has_pressures_in_force_and_calibration_reads_it(tmp_path):

@@ -1,7 +1,6 @@
 """Moving goals and policies of motion: corrections of goals, leads, the lag of the shape."""
 
 import dataclasses
-from collections import deque
 
 import numpy as np
 import pytest
@@ -9,12 +8,10 @@ import pytest
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.moving import ShapeLag, WayError, tip_lag_s
 from mjx_softarm.deploy.session import trace
-from mjx_softarm.mdp.observation import RATE_S, TIP_MM_PER_S
 from mjx_softarm.policy.lag import spring_lag_s
-from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import estimate_frame
 from mjx_softarm.sensing.s2r import inputs
-from tests.linear_arm import DT_S, POLICY, SPEC, SPRINGS_M, LinearArm, N, go, moves_aside
+from tests.linear_arm import DT_S, POLICY, SPEC, LinearArm, N, go, moves_aside
 from tests.networks import s2r_of
 
 
@@ -85,35 +82,6 @@ def test_the_tip_lags_by_the_law(slower):
     law_s = np.mean(spring_lag_s(policy, np.zeros(N)) @ np.ones(N))
     lag_s = tip_lag_s(Controller.of(policy, high))
     assert lag_s == pytest.approx(SPEC.control.reference_s + law_s + DT_S, rel=0.1)
-
-
-def test_what_a_plan_waits_is_part_of_the_lag():
-    kept = deque(maxlen=11)
-
-    def late(pose, goal, spring_m, sensed):
-        kept.append(goal)
-        return high(pose, kept[0], spring_m, sensed)
-
-    assert tip_lag_s(Controller.of(OF_MOTION, late)) - tip_lag_s(
-        Controller.of(OF_MOTION, high)
-    ) == pytest.approx(10 * DT_S, abs=1e-3)
-
-
-def test_the_rehearsal_tells_the_policy_of_motion_what_the_loop_tells_it():
-    """The tip's velocity is that of poses at rest; the pose itself lags."""
-    told = []
-
-    def noting(pose, goal, spring_m, sensed):
-        told.append((pose, tip_pose(policy, spring_m, 0.0)[0], sensed))
-        return SPRINGS_M[len(told) // 10 % 2]  # moves on, sometimes
-
-    policy = moves_aside(dataclasses.replace(POLICY, observation="motion", action_s=0.3))
-    tip_lag_s(Controller.of(policy, noting))
-    poses, at_rest, sensed = map(np.array, zip(*told[:200], strict=True))
-    moved_mm = at_rest[50:, :3] - at_rest[45:-5, :3]
-    velocity = slice(2 * N, 2 * N + 3)
-    np.testing.assert_allclose(sensed[50:, velocity] * TIP_MM_PER_S * RATE_S, moved_mm, atol=0.05)
-    assert np.abs(poses - at_rest).max() > 1.0
 
 
 GOAL = np.array([0.0, 0.0, -585.0, 0.0, 0.0, 0.0])

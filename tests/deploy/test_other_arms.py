@@ -3,20 +3,15 @@
 import numpy as np
 import pytest
 
-from mjx_softarm._support.errors import InputError
-from mjx_softarm.control import at_chambers
 from mjx_softarm.deploy.belief import stuck_springs
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drive import Drive, Hold
 from mjx_softarm.deploy.drivers.names import check_arm, check_number
-from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import follow
-from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.twin.arm import Twin
-from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS
+from tests.arms import FOUR_CHAMBERS
 from tests.linear_arm import Leaking, LinearArm, gain_of, make_policy
 
 
@@ -47,23 +42,6 @@ def test_goal_is_reached_and_no_pressure_is_spent_in_vain(other_arm):
     if allocation is not None:
         np.testing.assert_allclose(allocation.redundant @ run.log.pressure_kpa[row], 0.0, atol=0.1)
     np.testing.assert_array_equal(arm.written[-1], 0.0)
-
-
-def test_the_chamber_that_keeps_an_arm_from_rest_is_named():
-    """References beside any plane, in the first section, are held as well as a plane can."""
-
-    class Swinging(LinearArm):
-        @property
-        def spring_m(self):
-            swing_m = 2e-3 * np.sin(2 * np.pi * 0.7 * self.time_s)
-            return super().spring_m + np.where(np.arange(12) == 6, swing_m, 0.0)
-
-    beside_m = 8e-3 * np.append([1.0, -1.0, 1.0, -1.0], np.zeros(8))
-    controller = controller_of(FOUR_CHAMBERS, springs_at(FOUR_CHAMBERS, np.full(12, -5.0)) + beside_m)
-    goal = np.asarray(estimate(controller.policy.estimator, np.full(12, 0.2), 0.0), float)
-    run = follow(Swinging(spec=FOUR_CHAMBERS), controller, [goal], duration_s=20.0)
-    told = [event.message for event in run.events if event.fault is Fault.NOT_SETTLED]
-    assert told and all(", chamber6 is " in text for text in told)
 
 
 def test_lost_chamber_is_told_from_the_springs(other_arm):
@@ -109,34 +87,6 @@ def test_spring_is_stuck_if_the_chamber_beside_it_is_driven():
         assert np.flatnonzero(stuck_springs(spring_m, pressure_kpa, 3)).tolist() == expected
     spring_m[:, 5] += np.linspace(0.0, 3e-3, 25)  # a spring of the same section
     assert np.flatnonzero(stuck_springs(spring_m, np.zeros((25, 18)), 3)).tolist() == [4]
-
-
-def test_record_of_other_arms(other_arm):
-    """Logs have a column for each spring and each chamber."""
-    targets_kpa = random_pressures(other_arm, 2, 0)
-    found = record(LinearArm(spec=other_arm), other_arm, 0.3 * targets_kpa)
-    assert found.n_poses == 2 and found.ending.status == 0
-    np.testing.assert_allclose(found.log.pressure_kpa, 0.3 * targets_kpa)
-    length_m = other_arm.spring_sensor.lengths(found.log.readings).length_m
-    expected_m = springs_at(other_arm, 0.3 * targets_kpa[0])
-    np.testing.assert_allclose(length_m[0], expected_m, atol=2e-4)
-
-
-def test_hold_of_other_arms(other_arm):
-    """References that no plane meets are held as well as a plane can."""
-    drive = Drive(LinearArm(spec=other_arm), other_arm)
-    n_springs = other_arm.n_springs
-    spring_m = springs_at(other_arm, np.full(other_arm.n_chambers, -5.0))
-    spring_m = spring_m + (1e-3 * (-1.0) ** np.arange(n_springs) if other_arm is FOUR_CHAMBERS else 0.0)
-    row = drive.to_rest(Hold(drive.gains, spring_m, drive.dt_s))
-    off_m = drive.sensor.lengths(row["readings"]).length_m - spring_m
-    assert np.abs(at_chambers(off_m, drive.gains.allocation)).max() < 3e-4
-
-
-def test_another_number_of_springs_is_refused():
-    """Readings are counted by springs, not by chambers."""
-    with pytest.raises(InputError, match="test: got 12 readings, expected 9, of the 3 sections of 'six'"):
-        check_number(LinearArm(spec=FOUR_CHAMBERS), SIX_CHAMBERS, "test")
 
 
 def test_twin_is_led_to_a_goal(other_arm):

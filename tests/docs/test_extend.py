@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
-from tests.train.small import CONFIG, SHORT, flags
+from tests.arms import SHORT
+from tests.train.small import CONFIG, flags
 from train.runs.folder import Run
 
 ROOT = Path(__file__).resolve().parents[2]

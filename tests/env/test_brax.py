@@ -13,7 +13,7 @@ from brax.training.agents.sac import networks, train
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
-from tests.train.small import SHORT
+from tests.arms import SHORT
 
 N_ARMS, EPISODE_LENGTH, N_STEPS = 8, 2, 96
 

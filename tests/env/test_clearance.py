@@ -5,21 +5,20 @@ import dataclasses
 import jax
 import numpy as np
 
-from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
+from tests.arms import SHORT
 
 MM = 1e-3
-SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 
 
 def test_in_motion_the_clearance_is_the_least_of_the_way(quick_compiler):
     """That of an action of six control periods against six actions of one, and the arm in the end."""
     config = EnvConfig(n_poses=64, mode="dynamic", dynamic_step_s=0.12, pipe_diameter_mm=300.0)
     long, short = (
-        ReachEnv(SHORT_ARM, dataclasses.replace(config, dynamic_step_s=step_s)) for step_s in (0.12, 0.02)
+        ReachEnv(SHORT, dataclasses.replace(config, dynamic_step_s=step_s)) for step_s in (0.12, 0.02)
     )
     keys = jax.random.split(jax.random.PRNGKey(0), 16)
     actions = jax.random.uniform(jax.random.PRNGKey(1), (16, long.action_size), minval=-1.0, maxval=1.0)
@@ -40,6 +39,6 @@ def test_in_motion_the_clearance_is_the_least_of_the_way(quick_compiler):
 
 def plain_clearance_m(q):
     """The distance of the bodies of arms (n, nv) to the wall, from kinematics in closed form."""
-    frames = jax.vmap(ChainKinematics(SHORT_ARM.link_length_m))(q)
+    frames = jax.vmap(ChainKinematics(SHORT.link_length_m))(q)
     plates = frames.plate_position, frames.plate_rotation
-    return body_clearance(CrossPipe.of_mm(300.0), *plates, SHORT_ARM)
+    return body_clearance(CrossPipe.of_mm(300.0), *plates, SHORT)

@@ -13,25 +13,37 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.spec import ArmSpec
 
+REFUSED = [
+    ({"engine": "mujoco"}, r"EnvConfig\.engine: got 'mujoco', expected one of"),
+    ({"mode": "static"}, r"EnvConfig\.mode: got 'static', expected one of"),
+    ({"observation": "motion"}, "got 'motion', expected 'pose' or 'payload' for arms at rest"),
+    ({"engine": "warp"}, "engine: got 'warp', expected one of .*'mjx', 'chain'"),
+    (
+        {"engine": "warp", "mode": "dynamic", "randomisation": Randomisation(friction_max_n=1.0)},
+        "friction_max_n: got 1.0, expected 0 with the engine 'warp'",
+    ),
+    ({"links_per_section": 0}, "links_per_section: got 0, expected at least 1"),
+    ({"clearance_cost_per_mm": 1.0}, "clearance_cost_per_mm: got 1.0, expected 0.0 without a pipe"),
+    ({"even_share": 1.1}, r"EnvConfig.even_share: got 1.1, expected 0 to 1"),
+    ({"dynamic_step_s": math.nan}, r"\.dynamic_step_s: got nan, expected a finite number >"),
+]
 
-@pytest.mark.parametrize("word", [{"engine": "mujoco"}, {"mode": "static"}])
-def test_an_unknown_engine_or_mode_is_refused_by_name(word):
-    (field, value), *_ = word.items()
-    with pytest.raises(ValueError, match=rf"EnvConfig\.{field}: got '{value}', expected one of"):
-        EnvConfig(**word)
+
+@pytest.mark.parametrize("settings, message", REFUSED)
+def test_settings_that_cannot_be_are_refused_by_name(settings, message):
+    with pytest.raises(ValueError, match=message):
+        EnvConfig(**settings)
 
 
-def test_an_arm_at_rest_observes_no_motion():
-    with pytest.raises(ValueError, match="got 'motion', expected 'pose' or 'payload' for arms at rest"):
-        EnvConfig(observation="motion")
-    assert EnvConfig(observation="motion", mode="dynamic").moves
+@pytest.mark.parametrize("value", [math.inf, -1.0])
+def test_a_number_that_is_negative_or_not_finite_is_refused_by_name(value):
+    with pytest.raises(ValueError, match=rf"\.threshold: got {value}, expected a finite number >"):
+        EnvConfig(reward=RewardConfig(threshold=value))
+    with pytest.raises(ValueError, match=rf"\.payload_max_kg: got {value}, expected a finite number >"):
+        Randomisation(payload_max_kg=value)
 
 
-def test_warp_moves_arms_without_dry_friction_and_needs_a_gpu(spec):
-    with pytest.raises(ValueError, match="engine: got 'warp', expected one of .*'mjx', 'chain'"):
-        EnvConfig(engine="warp")
-    with pytest.raises(ValueError, match="friction_max_n: got 1.0, expected 0 with the engine 'warp'"):
-        EnvConfig(engine="warp", mode="dynamic", randomisation=Randomisation(friction_max_n=1.0))
+def test_warp_needs_a_gpu(spec):
     with pytest.raises(InputError, match="engine 'warp': got a cpu, expected a GPU"):
         ReachEnv(spec, EnvConfig(engine="warp", mode="dynamic", n_poses=1))
 
@@ -43,32 +55,9 @@ def test_warp_that_is_not_installed_is_told(spec, monkeypatch):
         put(build_model(spec), warp=True)
 
 
-@pytest.mark.parametrize(
-    "kind, field",
-    [
-        (EnvConfig, "dynamic_step_s"),
-        (EnvConfig, "saturation_tolerance_mm"),
-        (Randomisation, "payload_max_kg"),
-        (Randomisation, "sensor_noise_mm"),
-        (lambda **weight: EnvConfig(reward=RewardConfig(**weight)), "threshold"),
-    ],
-)
-@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
-def test_a_number_that_is_negative_or_not_finite_is_refused_by_name(kind, field, value):
-    with pytest.raises(ValueError, match=rf"\.{field}: got {value}, expected a finite number >"):
-        kind(**{field: value})
-
-
 def test_the_simulated_arm_may_have_fewer_links_than_the_specified_one():
     spec = ArmSpec.default()
     coarse = EnvConfig(links_per_section=2).arm(spec)
     assert coarse.n_links == 2 * spec.structure.n_sections < spec.n_links
     assert coarse.replace(structure=dataclasses.asdict(spec.structure)) == spec
     assert EnvConfig().arm(spec) is spec
-    with pytest.raises(ValueError, match="links_per_section: got 0, expected at least 1"):
-        EnvConfig(links_per_section=0)
-
-
-def test_a_clearance_without_a_wall_is_refused():
-    with pytest.raises(ValueError, match="clearance_cost_per_mm: got 1.0, expected 0.0 without a pipe"):
-        EnvConfig(clearance_cost_per_mm=1.0)

@@ -7,16 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import frame_from_pose
+from tests.arms import SHORT
 from tests.networks import s2r_of
 
 MM = 1e-3
-SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 
 
 def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_same():
@@ -24,7 +23,7 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
     config = EnvConfig(
         engine="chain", n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0), pipe_diameter_mm=300.0
     )
-    n_springs = SHORT_ARM.n_chambers
+    n_springs = SHORT.n_chambers
     weight = np.zeros((9 + n_springs, 6), np.float32)
     weight[9, 0] = 30.0  # mm for half the range of the first spring
     bound = np.array([40.0] * 3 + [0.2] * 3, np.float32)
@@ -35,9 +34,9 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
         input_low=np.float32(np.r_[low, np.full(n_springs, 0.05)]),
         input_high=np.float32(np.r_[high, np.full(n_springs, 0.35)]),
     )
-    plain, real = ReachEnv(SHORT_ARM, config), ReachEnv(SHORT_ARM, config, network)
+    plain, real = ReachEnv(SHORT, config), ReachEnv(SHORT, config, network)
     with pytest.raises(ValueError, match="got 3, expected 2, as the sim-to-real network has"):
-        ReachEnv(SHORT_ARM, dataclasses.replace(config, links_per_section=3), network)
+        ReachEnv(SHORT, dataclasses.replace(config, links_per_section=3), network)
     keys = jax.random.split(jax.random.PRNGKey(0), 16)
     actions = jax.random.uniform(jax.random.PRNGKey(1), (16, n_springs), minval=-0.5, maxval=0.5)
     starts = [xla.jit(jax.vmap(e.reset))(keys) for e in (plain, real)]
@@ -52,11 +51,11 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
         np.testing.assert_allclose(seen.pose[:, 1] - arm.pose[:, 1], -4.0, atol=0.01)
         assert np.abs(seen.pose[:, 3:] - arm.pose[:, 3:]).max() > 1.0
         np.testing.assert_allclose(other.obs, real.observe(seen.pose, seen.goal), atol=1e-5)
-        frames = jax.vmap(ChainKinematics(SHORT_ARM.link_length_m))(arm.motion.q)
+        frames = jax.vmap(ChainKinematics(SHORT.link_length_m))(arm.motion.q)
         share = jnp.array([0.0, 0.5, 1.0])[:, None]  # base, between the two links, tip
         plates_m = frames.plate_position + share * MM * (seen.pose - arm.pose)[:, None, :3]
         rotation = frames.plate_rotation.at[:, -1].set(frame_from_pose(seen.pose)[1])
-        wall_m = body_clearance(CrossPipe.of_mm(300.0), plates_m, rotation, SHORT_ARM)
+        wall_m = body_clearance(CrossPipe.of_mm(300.0), plates_m, rotation, SHORT)
         np.testing.assert_allclose(other.info["clearance_mm"], wall_m / MM, atol=0.02)
         assert np.abs(other.info["clearance_mm"] - one.info["clearance_mm"]).max() > 1.0
     shift_mm = 30.0 * (plain.pool.spring_m[:, 0] - 0.2) / 0.15

@@ -11,7 +11,6 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
 from mjx_softarm.env.state import EpisodeMotion
-from mjx_softarm.mechanics.motion.state import MotionParams
 from mjx_softarm.mechanics.params import ArmParams
 
 MM = 1e-3
@@ -82,7 +81,9 @@ def test_payloads_go_up_to_the_arm_s_largest_where_they_are_observed(spec):
 
 def test_a_payload_is_observed_as_it_is_from_start_to_end(spec, quick_compiler):
     short_arm = spec.replace(structure={"n_sections": 1, "links_per_section": 2})
-    env = ReachEnv(short_arm, EnvConfig(n_poses=64, observation="payload", randomisation=SPREAD))
+    env = ReachEnv(
+        short_arm, EnvConfig(engine="chain", n_poses=64, observation="payload", randomisation=SPREAD)
+    )
     start = xla.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
     actions = jax.random.uniform(jax.random.key(1), (64, env.action_size), minval=-1.0)
     after = xla.jit(jax.vmap(env.step))(start, actions)
@@ -130,14 +131,6 @@ def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spri
     np.testing.assert_allclose(loaded - nominal, -0.3 * 9.81 / (3 * area), rtol=1e-3)
     stretch = 0.1 * np.asarray(arm.chamber_stiffness[0]) * (0.19 - 0.2)
     np.testing.assert_allclose(stiffened - nominal, stretch / area, rtol=1e-3)
-
-
-def test_numbers_of_motion_fill_their_bounds(spec):
-    spread = Randomisation(damping_spread=0.2, delay_max_s=0.005, friction_max_n=1.5)
-    episode = EpisodeMotion(spec, EnvConfig(mode="dynamic", randomisation=spread))
-    for share, bounds in ((0.0, [0.8, 0.01, 0.0]), (1.0, [1.2, 0.015, 1.5])):
-        np.testing.assert_allclose(episode.params(jnp.full(3, share))[:3], bounds, rtol=1e-6)
-    assert episode.params(None) == MotionParams()
 
 
 def test_numbers_of_regulators_fill_their_bounds(spec):

@@ -15,6 +15,7 @@ from mjx_softarm.export.golden import FLAGS, N_SINGLE, read_golden
 from mjx_softarm.export.write import export_onnx
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.policy.runtime import PolicyRunner, actor_output
+from tests.arms import SIX_CHAMBERS, TAPERED
 from tests.export.conftest import carrying_policy, draw_wire_policy, few_golden_rows, moving_policy
 from tests.linear_arm import N
 
@@ -92,6 +93,7 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     agreeing_graph(draw_wire_policy(), tmp_path / "wires.npz")
 
 
+@pytest.mark.parametrize("other_arm", [SIX_CHAMBERS, TAPERED], ids=["six", "tapered"])
 def test_other_arms(tmp_path, other_arm):
     """References and lengths are per spring, pressures and the law's integral per chamber."""
     _, whole = agreeing_graph(moving_policy(other_arm), tmp_path / "other.npz")

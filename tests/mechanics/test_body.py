@@ -3,10 +3,9 @@
 import numpy as np
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.mechanics.body import COILS, FOLDS, ring_radius_m, shape
+from mjx_softarm.mechanics.body import COILS, FOLDS, shape
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_quaternion
 from mjx_softarm.twin.arm import Twin
-from tests.arms import FOUR_CHAMBERS, TAPERED
 from tests.linear_arm import REST_M, SPEC, N
 
 UNKNOWN = np.full(6, np.nan)
@@ -55,18 +54,3 @@ def test_shape_is_near_a_twin_s_markers():
     ends_m = rings.position_m.reshape(3, -1, 3)[:2, -1]
     off_m = np.linalg.norm(ends_m - seen.marker_m[[2, 5]], axis=1)
     assert off_m.max() < 0.02 and np.linalg.norm(np.diff(ends_m, axis=0)) > 0.1
-
-
-def test_sections_that_differ_are_drawn_so():
-    """A ring between two sections is the larger one's; bellows are as wide and as long as their sections."""
-    geometry = TAPERED.geometry
-    radius_m = 0.002 + np.array(geometry.spring_radius_m)
-    np.testing.assert_allclose(ring_radius_m(TAPERED), np.repeat(radius_m, [5, 4, 4]))
-    length_m = TAPERED.at_springs(TAPERED.geometry.section_length_m)
-    parts = shape(TAPERED, length_m, UNKNOWN)
-    np.testing.assert_allclose(parts.rings.width_m, ring_radius_m(TAPERED)[1:])
-    np.testing.assert_allclose(parts.folds.width_m, 0.5 * np.repeat(geometry.chamber_diameter_m, 3 * FOLDS))
-    np.testing.assert_allclose(parts.folds.pitch_m, np.repeat(geometry.section_length_m, 3 * FOLDS) / FOLDS)
-    np.testing.assert_allclose(parts.rings.position_m[-1], [0.0, 0.0, -TAPERED.length_m], atol=1e-12)
-    four = shape(FOUR_CHAMBERS, np.full(12, 0.2), UNKNOWN)
-    assert len(four.folds.pitch_m) == 12 * FOLDS and len(four.coils.pitch_m) == 12 * COILS

@@ -44,7 +44,7 @@ def dense(hessian):
     return full.reshape(n_arms, n_sections * N, n_sections * N)
 
 
-@pytest.mark.parametrize("n_sections", [1, 2, 5])
+@pytest.mark.parametrize("n_sections", [1, 3])
 def test_a_system_with_the_hessian_is_that_with_the_dense_matrix(n_sections):
     hessian, columns = chain(n_sections)
     assert np.linalg.eigvalsh(dense(hessian)).min() > 0
@@ -82,16 +82,7 @@ def test_a_matrix_that_is_not_positive_definite_gives_nan_and_its_neighbours_do_
     assert np.isnan(found[2]).all()
 
 
-def test_the_diagonal_is_added_where_it_belongs():
-    hessian, _ = chain(2)
-    one = jax.tree.map(lambda x: jnp.asarray(x[0]), hessian)
-    added = jnp.arange(2.0 * N)
-    np.testing.assert_allclose(
-        one.plus_diagonal(added).dense(), dense(hessian)[0] + np.diag(added), atol=1e-5
-    )
-
-
-@pytest.mark.parametrize("n", [1, 3, 4, 7])
+@pytest.mark.parametrize("n", [1, 3, 7])
 def test_elimination_of_rows_of_which_some_are_the_identity_s(n):
     rng = np.random.default_rng(n)
     matrix = np.float32(2.0 * np.eye(n) + 0.3 * rng.normal(size=(8, n, n)))  # not symmetric
@@ -107,8 +98,7 @@ def test_elimination_of_rows_of_which_some_are_the_identity_s(n):
     np.testing.assert_allclose(shared, np.linalg.solve(matrix[0], columns), atol=1e-5)
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0])
-@pytest.mark.parametrize("n, which", [(3, 1), (6, 4), (7, 6)])
+@pytest.mark.parametrize("n, which, value", [(3, 1, 0.0), (7, 6, -1.0)])
 def test_a_pivot_that_is_not_positive_gives_nan_and_its_neighbours_do_not(n, which, value):
     matrix = np.stack(3 * [2.0 * np.eye(n, dtype=np.float32)])
     matrix[1, which, which] = value

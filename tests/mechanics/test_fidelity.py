@@ -20,10 +20,9 @@ from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
-from tests.arms import OTHER_ARMS
+from tests.arms import OTHER_ARMS, SHORT
 
 SPEC = ArmSpec.default()
-SHORT_ARM = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})  # MJX compiles more slowly
 GAINS = control.Gains.from_spec(SPEC)
 N = 128
 POSITION_MM, ANGLE_DEG = 0.1, 0.1
@@ -126,7 +125,7 @@ def test_neither_time_step_nor_damping_nor_gains_move_the_rest():
 
 
 def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
-    model = mjx.put_model(fast_model(SHORT_ARM))
+    model = mjx.put_model(fast_model(SHORT))
     n_ticks = 300
 
     def rest_of(reference):
@@ -143,9 +142,9 @@ def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
         (data, law), _ = jax.lax.scan(tick, (start, law), None, length=n_ticks)
         return data.qpos, data.qvel, law.integral_kpa
 
-    q, velocity, pressure = xla.jit(jax.vmap(rest_of))(np.float32(references(N, 0, SHORT_ARM)))
+    q, velocity, pressure = xla.jit(jax.vmap(rest_of))(np.float32(references(N, 0, SHORT)))
     assert np.abs(velocity).max() < 1e-6
-    rest = truth(N, 0, SHORT_ARM)
+    rest = truth(N, 0, SHORT)
     found = at_q(q)
     assert position_error_mm(found, rest).max() < POSITION_MM / 10
     assert angle_error_deg(found, rest).max() < ANGLE_DEG / 10
@@ -154,7 +153,7 @@ def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
 
 def at_q(q):
     """Tips of joint coordinates, from C MuJoCo; only the tips' fields are filled."""
-    model = build_model(SHORT_ARM)
+    model = build_model(SHORT)
     data = mujoco.MjData(model)
     position, rotation = [], []
     for row in np.asarray(q):

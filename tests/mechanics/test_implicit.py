@@ -13,13 +13,10 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle, settle_pressures
 from mjx_softarm.mechanics.statics import statics
-from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS, TAPERED
+from tests.arms import FOUR_CHAMBERS, SHORT, SIX_CHAMBERS, TAPERED
 
 SPEC = ArmSpec.default()
-SHORT = SPEC.replace(structure={"n_sections": 2, "links_per_section": 2})
-ONE = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
 DIFFERENTIATED = {
-    "three": SHORT,
     "tapered": TAPERED.replace(structure={"links_per_section": 1}),
     "four": FOUR_CHAMBERS.replace(structure={"n_sections": 1, "links_per_section": 2}),
     "six": SIX_CHAMBERS.replace(structure={"n_sections": 1, "links_per_section": 2}),
@@ -124,7 +121,7 @@ def test_the_derivative_is_that_of_finite_differences_at_the_same_active_set(arm
 
 
 def test_reverse_mode_is_the_transpose_of_forward_mode():
-    params, reference = ArmParams.from_spec(ONE), np.float32(references(ONE)[:8])
+    params, reference = ArmParams.from_spec(SHORT), np.float32(references(SHORT)[:8])
     rng = np.random.default_rng(2)
     direction = jax.tree.map(lambda x: np.float32(x * rng.normal(size=np.shape(x))), params)
     turn = np.float32(0.01 * rng.normal(size=reference.shape))
@@ -149,7 +146,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode():
 def test_held_pressures_have_the_derivative_of_their_own_equilibrium():
     """dq = H^-1 B dp, since pressures are limits that leave no room."""
     with jax.enable_x64(True):
-        params = ArmParams.from_spec(ONE, np.float64)
+        params = ArmParams.from_spec(SHORT, np.float64)
         kinematics = chain_kinematics(params)
         pressure = np.random.default_rng(3).uniform(-35.0, 15.0, 3)
 
@@ -164,8 +161,8 @@ def test_held_pressures_have_the_derivative_of_their_own_equilibrium():
 
 
 def test_an_arm_that_does_not_settle_has_a_zero_derivative():
-    params = ArmParams.from_spec(ONE.replace(backbone={"bending_stiffness_nm_per_rad": 1e-3}))
-    reference = np.float32(references(ONE)[:8])
+    params = ArmParams.from_spec(SHORT.replace(backbone={"bending_stiffness_nm_per_rad": 1e-3}))
+    reference = np.float32(references(SHORT)[:8])
     reference[3, 0] = np.nan
 
     def fields(reference, spring_rest_m):

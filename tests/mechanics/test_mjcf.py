@@ -101,38 +101,6 @@ def renderer(model):
         yield opened
 
 
-def coloured(image, low, high):
-    """Rows and columns of the pixels whose hue, in turns, lies in a range."""
-    rgb = image.astype(float)
-    largest, smallest = rgb.max(-1), rgb.min(-1)
-    vivid = largest - smallest > 80
-    red, green, blue = np.moveaxis(rgb, -1, 0)
-    spread = np.maximum(largest - smallest, 1.0)
-    hue = np.select(
-        [largest == red, largest == green],
-        [((green - blue) / spread) % 6.0, (blue - red) / spread + 2.0],
-        (red - green) / spread + 4.0,
-    )
-    return np.argwhere(vivid & (hue / 6.0 >= low) & (hue / 6.0 < high))
-
-
-def test_a_picture_shows_three_sections_one_below_the_other(renderer):
-    image = renderer.draw(np.zeros(36))
-    assert image.shape == (200, 150, 3) and image.dtype == np.uint8
-    red, yellow, blue = (coloured(image, *hue) for hue in ((0.0, 0.07), (0.08, 0.17), (0.5, 0.7)))
-    assert min(map(len, (red, yellow, blue))) > 200
-    assert red[:, 0].mean() + 20 < yellow[:, 0].mean() < blue[:, 0].mean() - 20
-
-
-def test_a_picture_shows_where_the_arm_bends(renderer):
-    camera = render.Camera(azimuth_deg=0.0)  # looks along +x
-    columns = []
-    for bend in (0.15, 0.0, -0.15):  # about +x: swings to +y, the picture's left
-        image = renderer.draw(np.tile([0.0, bend, 0.0], 12), camera)
-        columns.append(coloured(image, 0.5, 0.7)[:, 1].mean())
-    assert columns[0] + 10 < columns[1] < columns[2] - 10
-
-
 @pytest.mark.parametrize("q", [np.zeros(35), np.full(36, np.nan)])
 def test_a_picture_of_nothing_is_refused(renderer, q):
     with pytest.raises(ValueError, match=r"^q: got"):

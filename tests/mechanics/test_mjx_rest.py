@@ -12,13 +12,13 @@ from mjx_softarm.mechanics.mjx_rest import measured
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, SettleResult, settle
 from mjx_softarm.spec import ArmSpec
+from tests.arms import SHORT
 
 N = 64
-ONE_SECTION = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 LOADED_KG = 0.3
 
 
-@pytest.fixture(scope="module", params=[ONE_SECTION, pytest.param(ArmSpec.default(), marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[SHORT, pytest.param(ArmSpec.default(), marks=pytest.mark.slow)])
 def at_rest(request):
     """Loaded arms at random references: many of their chambers are at a limit."""
     spec = request.param

@@ -27,9 +27,9 @@ from mjx_softarm.mechanics.motion.state import (
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.statics import all_tendons, chambers_and_springs
 from mjx_softarm.mechanics.workspace import settle_many
+from tests.arms import SHORT
 
 SPEC = ArmSpec.default()
-SHORT_ARM = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
 GAINS, PERIOD_S = control.Gains.from_spec(SPEC), 0.02
 TRUE_STEP_S = 2.5e-4  # at 1 ms MuJoCo itself is 0.4 mm (95 %) from this
 N_HOLDS, HOLD_TICKS = 4, 25  # a new reference each half second, for 2 s
@@ -117,14 +117,14 @@ def mover(spec, engine=midpoint, step_s=PERIOD_S, longest_delay_s=0.0):
     return lambda *args, params=nominal: many(*args, params)
 
 
-@pytest.mark.parametrize("links", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("links", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_transients_of_both_engines_are_those_of_c_mujoco(links):
-    """Within 1 mm at 95 % over 2 s, with a random reference each half second."""
+    """Within 1 mm at 95 % over 1 s, with a random reference each half second."""
     spec = SPEC.replace(structure={"links_per_section": links})
-    n_arms = 2 * links  # 4, and 8 in the slow test
-    start, asked = starts(spec, n_arms), references(spec, n_arms)
+    n_arms = 4 + links
+    start, asked = starts(spec, n_arms), references(spec, n_arms)[:, : 2 * HOLD_TICKS]
     true = np.array([true_tips(spec, *each) for each in zip(*start, asked, strict=True)])
-    assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 200.0  # mm on the way
+    assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 150.0  # mm on the way
 
     def tips(engine, step_s):
         moved = mover(spec, engine, step_s)(*start, np.float32(asked), MotionParams())
@@ -161,45 +161,23 @@ def test_the_inertia_is_that_of_c_mujoco():
         np.testing.assert_allclose(found_bias, data.qfrc_bias, atol=1e-5 * np.abs(data.qfrc_bias).max())
 
 
-def test_arms_in_chunks_move_as_each_does_alone():
-    """Two of five at once, the last chunk filled up; their gradients, too."""
-    start, asked = starts(SHORT_ARM, 5), np.float32(references(SHORT_ARM, 5))[:, 0]
-    model, data = put(build_model(SHORT_ARM))
-    nominal = jax.tree.map(jnp.asarray, ArmParams.from_spec(SHORT_ARM))
-
-    def height(q, pressure_kpa, reference_m, friction_n, n_at_once=None):
-        arm = MovingArm(model, data, nominal, MotionParams(friction_n=friction_n))
-        _, springs = chambers_and_springs(all_tendons(chain_kinematics(nominal)(q), nominal), nominal)
-        motion = Motion.at_rest(q, pressure_kpa, springs.length)
-        times_s = 3 * PERIOD_S, PERIOD_S, PERIOD_S
-        end = midpoint.advance(arm, motion, reference_m, GAINS, *times_s, n_at_once)[1]
-        return end.tip_position_m[0], end
-
-    slope = jax.value_and_grad(height, argnums=(0, 2), has_aux=True)
-    arguments = *start, asked, np.float32(np.arange(5))
-    chunks = jax.jit(jax.vmap(lambda *x: slope(*x, n_at_once=2)))(*arguments)
-    alone = jax.jit(lambda *x: jax.lax.map(lambda row: slope(*row), x))(*arguments)
-    for found, expected in zip(*map(jax.tree.leaves, (chunks, alone)), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
-
-
 @pytest.fixture(scope="module")
 def short():
     """Four small arms, references that change each half second, and the function that moves them."""
-    return starts(SHORT_ARM, 4), np.float32(references(SHORT_ARM, 4)), mover(SHORT_ARM)
+    return starts(SHORT, 4), np.float32(references(SHORT, 4)), mover(SHORT)
 
 
 def test_mjx_steps_as_c_mujoco_does():
     """With an episode's payload, stiffness, damping and friction; MJX has float32, C MuJoCo float64."""
     step_s, own = 0.005, MotionParams(damping=1.2, friction_n=1.5)
-    start, asked = starts(SHORT_ARM, 4), references(SHORT_ARM, 4)
-    nominal = ArmParams.from_spec(SHORT_ARM)
+    start, asked = starts(SHORT, 4), references(SHORT, 4)
+    nominal = ArmParams.from_spec(SHORT)
     stiffness = np.float32(nominal.chamber_stiffness * [0.9, 1.0, 1.1])
     masses = np.float32(nominal.tool_mass_kg + 0.3 * np.eye(2)[PAYLOAD])
     params = nominal._replace(tool_mass_kg=masses, chamber_stiffness=stiffness)
-    moved = mover(SHORT_ARM, mjx_step, step_s)(*start, np.float32(asked), own, params=params)
+    moved = mover(SHORT, mjx_step, step_s)(*start, np.float32(asked), own, params=params)
 
-    model, chambers = build_model(SHORT_ARM), slice(SHORT_ARM.n_chambers)
+    model, chambers = build_model(SHORT), slice(SHORT.n_chambers)
     model.body("payload").mass, model.tendon_stiffness[chambers] = masses[PAYLOAD], stiffness
     model.dof_damping *= own.damping
     damping = own.damping * model.tendon_damping
@@ -211,7 +189,7 @@ def test_mjx_steps_as_c_mujoco_does():
         mujoco.mj_fwdVelocity(model, data)
 
     true = np.array(
-        [true_tips(SHORT_ARM, *each, step_s, model, set_dampers) for each in zip(*start, asked, strict=True)]
+        [true_tips(SHORT, *each, step_s, model, set_dampers) for each in zip(*start, asked, strict=True)]
     )
     assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 20.0  # mm on the way
     np.testing.assert_allclose(moved.tip_position_m, true, atol=1e-6)
@@ -234,21 +212,12 @@ def test_commands_in_force_are_their_mean_over_the_time_before_the_dead_time():
         before, earlier = command, pushed(earlier, before)
 
 
-def test_a_command_waits_for_the_valves(short):
-    start, asked, move = short
-    delays = MotionParams(delay_s=PERIOD_S), MotionParams()
-    late, soon = (move(*start, asked, own).pressure_kpa for own in delays)
-    np.testing.assert_allclose(late[:, 0], start.pressure_kpa, atol=1e-2)
-    assert np.abs(soon[:, 0] - start.pressure_kpa).max() > 0.3
-    assert np.abs(late[:, 1] - start.pressure_kpa).max() > 0.3
-
-
 @pytest.mark.parametrize(("engine", "step_s", "most_mm"), [(midpoint, PERIOD_S, 0.3), (mjx_step, 0.005, 0.8)])
 def test_arms_behind_slow_regulators_move_as_c_mujoco_does(engine, step_s, most_mm):
     """Commands wait for no, two and a half, and some four control periods."""
     dead_time_s = (0.0, 0.05, 0.085)
     numbers = {"lag_s": 0.3, "fill_kpa_per_s": 60.0, "vent_kpa_per_s": 25.0, "deadband_kpa": 0.2}
-    spec = SHORT_ARM.replace(actuators={"kind": "regulator", "dead_time_s": dead_time_s, **numbers})
+    spec = SHORT.replace(actuators={"kind": "regulator", "dead_time_s": dead_time_s, **numbers})
     start, asked = starts(spec, 4), references(spec, 4)
     regulator = jax.tree.map(np.float32, spec.actuators.per_chamber(3))
     own = MotionParams(delay_s=regulator.delay_s, actuators=regulator)
@@ -266,7 +235,7 @@ def test_dry_friction_is_that_of_c_mujoco(short):
     )
     true = np.array(
         [
-            true_tips(SHORT_ARM, *each, before_step=dry_friction(friction_n))
+            true_tips(SHORT, *each, before_step=dry_friction(friction_n))
             for each in zip(*start, asked, strict=True)
         ]
     )

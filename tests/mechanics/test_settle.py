@@ -17,7 +17,6 @@ from mjx_softarm.mechanics.settle import (
     RESIDUAL_TOLERANCE,
     TRACKING_TOLERANCE_M,
     SettleResult,
-    arms_at_once,
     settle,
 )
 from mjx_softarm.mechanics.workspace import settle_many
@@ -264,12 +263,6 @@ def test_many_arms_settle_as_each_does_alone_whatever_numbers_they_share():
     expected = [[softened_alone(x, k) for k in range(3)] for x in softer[:2].tolist()]
     np.testing.assert_allclose(shared, expected, atol=1e-6)
     assert "scan" in str(jax.make_jaxpr(settle_all)())
-
-
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere more arms are always faster")
-@pytest.mark.parametrize("links, n", [(2, 128), (4, 128), (6, 64), (8, 32), (10, 16), (40, 16)])
-def test_a_cpu_settles_fewer_arms_at_once_the_more_links_they_have(links, n):
-    assert arms_at_once(3 * links) == n
 
 
 def test_new_numbers_need_no_new_compilation():

@@ -145,16 +145,3 @@ def test_single_precision_is_far_finer_than_what_counts_as_settled():
         gradient = solved(spec, q, pressure, np.float32).gradient
         assert gradient.dtype == np.float32
         np.testing.assert_allclose(gradient, -force, atol=RESIDUAL_TOLERANCE / 5)
-
-
-def test_parameters_are_the_specification_s_in_base_units():
-    spec = odd_arm().replace(chambers={"bonded_share": 0.0})
-    params = ArmParams.from_spec(spec, np.float64)
-    np.testing.assert_allclose(params.area, 1e3 * np.array(spec.chambers.area_m2))  # N per kPa
-    np.testing.assert_allclose(params.chamber_rest_m, 0.2 + np.array(spec.chambers.length_offset_m))
-    np.testing.assert_allclose(params.tool_mass_kg, [0.45, 0.3])
-    np.testing.assert_allclose(params.tool_offset_m, [0.05, 0.1])
-    assert params.link_mass_kg.sum() == pytest.approx(4.25)
-    assert params.section_length_m == pytest.approx(0.2)
-    assert params.n_sections == 3
-    assert {np.asarray(x).dtype for x in jax.tree.leaves(ArmParams.from_spec(spec))} == {np.dtype(np.float32)}

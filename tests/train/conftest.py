@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import ReachEnv
-from tests.train.small import CONFIG, LEARNER, SHORT
+from tests.arms import SHORT
+from tests.train.small import CONFIG, LEARNER
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import GoalStage, ImitationConfig
 from train.config import TrainConfig
 from train.demos.demonstrations import Demonstrations
-from train.runs import evaluate
 
 N_POSITIONS = 6
 # A base and a tip that are mounted askew, as on every calibrated arm.
@@ -48,15 +48,3 @@ def shown(short_env):
     pool = short_env.pool
     positions, actions = pool.pose[:N_POSITIONS], short_env.action_of(pool.spring_m[:N_POSITIONS])
     return Demonstrations(positions, actions, np.zeros(N_POSITIONS, np.int32))
-
-
-@pytest.fixture
-def shift_limit(monkeypatch):
-    """Limit (6,) of shifts of goals [mm, deg], whose first entry evaluations report as `near_s`."""
-
-    def limited(env, learner, policy, state, goal, n_actions, limit, take=evaluate.reach):
-        after, result = take(env, learner, policy, state, goal, n_actions, limit)
-        return after, result._replace(near_s=limit[0])
-
-    monkeypatch.setattr(evaluate, "reach", limited)
-    return np.repeat([25.0, 5.0], 3)

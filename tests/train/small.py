@@ -2,13 +2,12 @@
 
 from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import EnvConfig
-from mjx_softarm.spec import ArmSpec
+from tests.arms import SHORT as SHORT
 from train.agent.registry import epoch_of
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 from train.epoch.job import Job
 
-SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 SETTINGS = {
     "n_arms": 8,
     "total_env_steps": 128,

@@ -20,7 +20,8 @@ from mjx_softarm.mechanics import workspace
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
-from tests.train.small import CONFIG, SHORT, distil_little, flags, new_job
+from tests.arms import SHORT
+from tests.train.small import CONFIG, distil_little, flags, new_job
 from train.__main__ import main
 from train.runs.folder import Run, sole_trainer
 
@@ -55,7 +56,7 @@ def send_in_epoch_6(number):
     return log_and_send
 
 
-NEW = ["reach", *flags(), "--evaluation-epochs=4", "--spec"]
+NEW = ["reach", *flags(total_env_steps=128), "--evaluation-epochs=4", "--spec"]  # eight epochs
 DIES = """
 import signal, sys
 from tests.train.test_cli import Run, main, send_in_epoch_6
@@ -66,7 +67,7 @@ main(sys.argv[1:])
 
 @pytest.fixture(scope="module")
 def whole(arm, tmp_path_factory):
-    """A run of 16 epochs, trained without a stop."""
+    """A run of eight epochs, trained without a stop."""
     workspace._solver.cache_clear()  # others may have compiled it with other options than the process below
     out = tmp_path_factory.mktemp("runs") / "whole"
     assert main([*NEW, arm, "--out", str(out)]) == 0
@@ -88,9 +89,9 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(whole, arm, tmp_path,
     assert "begins anew" not in capsys.readouterr().out
 
     (epoch, expected), (resumed_epoch, resumed) = final_state(whole), final_state(killed)
-    assert epoch == resumed_epoch == 16
+    assert epoch == resumed_epoch == 8
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(expected), jax.device_get(resumed))
-    assert [row["epoch"] for row in Run.open(killed).metrics()] == list(range(1, 17))
+    assert [row["epoch"] for row in Run.open(killed).metrics()] == list(range(1, 9))
     figures = [json.loads((run / "evaluation.json").read_text()) for run in (whole, killed)]
     assert figures[0] == figures[1]
 
@@ -243,7 +244,7 @@ def demonstrations(tmp_path_factory):
     return str(path)
 
 
-def test_imitation_hands_its_reward_and_its_layers_on(arm, demonstrations, tmp_path, capsys):
+def test_imitation_hands_its_reward_and_its_layers_on(arm, demonstrations, tmp_path, monkeypatch, capsys):
     # 8 epochs, the second stage from the fourth
     changes = {"total_env_steps": 128, "rebalance_env_steps": 48, "gail.hidden": 16}
     settings = ["--evaluation-epochs=4", "--learner.stages", "0.5,2,1", "0.5,1,0.5", "--spec", arm]
@@ -265,6 +266,7 @@ def test_imitation_hands_its_reward_and_its_layers_on(arm, demonstrations, tmp_p
 
     narrow = flags(**changes, hidden=8)  # the agent's layers are taken all the same
     donors = ["--agent", str(donor), "--reward", str(donor)]
+    monkeypatch.setattr("train.runs.command._train", lambda *_: 0)  # what it begins with is stored before
     assert main(["imitate", demonstrations, *narrow, *settings, *donors, "--out", str(heir)]) == 0
     rewards = [Run.open(run).checkpoints.parts()["reward"] for run in (donor, heir)]
     jax.tree.map(np.testing.assert_array_equal, *rewards)

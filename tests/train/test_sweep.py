@@ -14,8 +14,9 @@ from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
+from tests.arms import SHORT
 from tests.train import small
-from tests.train.small import SHORT, new_job
+from tests.train.small import new_job
 from train import sweep
 from train.__main__ import main
 from train.config import override
@@ -203,20 +204,14 @@ def test_a_sweep_as_a_user_runs_it(tmp_path, capsys):
 
 
 def test_members_are_the_product_of_seeds_and_values():
-    members = members_of(PRESETS["quick"], (0, 7), ["learner.gamma=0.5, 0.9", "env.reward.goal-bonus=50"])
-    assert {name: (c.seed, c.learner.gamma, c.env.reward.goal_bonus) for name, c in members.items()} == {
-        "seed0-learner.gamma=0.5-env.reward.goal_bonus=50": (0, 0.5, 50.0),
-        "seed0-learner.gamma=0.9-env.reward.goal_bonus=50": (0, 0.9, 50.0),
-        "seed7-learner.gamma=0.5-env.reward.goal_bonus=50": (7, 0.5, 50.0),
-        "seed7-learner.gamma=0.9-env.reward.goal_bonus=50": (7, 0.9, 50.0),
+    """Values may have signs and exponents."""
+    members = members_of(CONFIG, (0, 7), ["learner.target-entropy=-30, -2e1", "env.reward.goal-bonus=50"])
+    found = {name: (c.seed, c.learner.target_entropy, c.env.reward.goal_bonus) for name, c in members.items()}
+    assert found == {
+        f"seed{seed}-learner.target_entropy={text}-env.reward.goal_bonus=50": (seed, float(text), 50.0)
+        for seed in (0, 7)
+        for text in ("-30", "-2e1")
     }
-
-
-def test_values_may_have_signs_and_exponents():
-    vary = ["learner.learning-rate=1e-3,3e-4", "learner.target-entropy=-30,-20"]
-    learners = [config.learner for config in members_of(CONFIG, (0,), vary).values()]
-    rates = [(learner.learning_rate, learner.target_entropy) for learner in learners]
-    assert rates == [(1e-3, -30.0), (1e-3, -20.0), (3e-4, -30.0), (3e-4, -20.0)]
 
 
 def test_the_table_has_mean_least_and_greatest_over_the_seeds(tmp_path):

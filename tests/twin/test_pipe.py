@@ -32,15 +32,6 @@ def push(arm, body, force_n):
     arm._data.xfrc_applied[arm._model.body(body).id, :3] = force_n
 
 
-@pytest.fixture(scope="module")
-def pressed():
-    """A twin at rest, its middle pressed against the wall by 20 N; tests only read it."""
-    arm = Twin(3, build=QUIET, pipe=PIPE)
-    push(arm, "link14", [6.0, 19.0, 0.0])
-    hold(arm, 12.0)
-    return arm
-
-
 def test_walls_enclose_the_pipe_without_a_hole():
     """Free points lie in no plank; points outside by 1 to 30 mm all lie in one."""
     rng = np.random.default_rng(0)
@@ -134,12 +125,6 @@ def test_forces_carry_the_weight_of_what_lies_in_the_pipe(at, wall, container):
     np.testing.assert_allclose(force, 2.0 * 9.81 * np.array([wall, container]), rtol=2e-3, atol=1e-9)
 
 
-def test_wall_yields_little_to_a_load_at_rest(pressed):
-    assert pressed._data.ncon > 0 and pressed.wall_force_n().container == 0.0
-    assert -1e-3 < pressed._data.contact.dist.min() < 0.0
-    assert np.abs(pressed._data.qvel).max() < 0.01
-
-
 @pytest.mark.parametrize("direction", [[0.0, 1.0, 0.0], [0.6, 0.8, 0.0], [1.0, 0.0, 0.0]])
 def test_gripper_pressed_against_the_wall(direction):
     """By 20 N within 2 s; the third direction leads into a branch, and the arm against its edge."""
@@ -152,20 +137,11 @@ def test_gripper_pressed_against_the_wall(direction):
     assert 10.0 < sum(arm.wall_force_n()) < 25.0
 
 
-def test_force_is_the_largest_of_the_last_period(monkeypatch):
-    arm, steps = Twin(3, build=QUIET, pipe=PIPE), []
+def test_force_is_that_of_the_last_period():
+    arm = Twin(3, build=QUIET, pipe=PIPE)
     assert arm.wall_force_n() == (0.0, 0.0)
     push(arm, "link14", [0.0, 30.0, 0.0])
-
-    def seen(*of_step):
-        steps.append(contact_force(*of_step))
-        return steps[-1]
-
-    monkeypatch.setattr("mjx_softarm.twin.arm.contact_force", seen)
-    for _ in range(40):
-        steps.clear()
-        hold(arm, 0.02)
-        assert len(steps) == 4 and arm.wall_force_n() == tuple(np.max(steps, axis=0))
+    hold(arm, 0.8)
     assert arm.wall_force_n().wall > 1.0
     push(arm, "link14", 0.0)
     hold(arm, 4.0)
@@ -180,13 +156,6 @@ def test_arm_that_touches_nothing_moves_as_without_a_pipe():
         assert arm.wall_force_n() == (0.0, 0.0)
         tips_m.append(arm.motion_capture().tip_m)
     np.testing.assert_allclose(*tips_m, atol=1e-9)
-
-
-def test_without_a_pipe_nothing_can_touch():
-    model = Twin(7)._model
-    assert not model.geom_contype.any() and not model.geom_conaffinity.any() and model.nmesh == 0
-    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    assert model.opt.disableflags & off == off
 
 
 @pytest.mark.parametrize("diameter_mm", [300.0, 250.0])
@@ -216,19 +185,13 @@ def test_arms_in_pipes_by_name():
     assert all(open_arm(f"twin:{seed}:pipe200").wall_force_n() == (0.0, 0.0) for seed in (1, 4))
 
 
-def test_picture_shows_the_arm_in_the_open_pipe_and_what_it_holds():
-    arms = [Twin(0, build=Build(gap=0.0), pipe=pipe) for pipe in (None, PIPE)]
+def test_picture_shows_what_the_arm_holds_in_the_pipe():
+    arm = Twin(0, build=Build(gap=0.0), pipe=PIPE)
     try:
-        with arms[1].renderer(140, 180) as renderer:
-            hanging = arms[1].draw(renderer).astype(int)
-            arms[1].attach(0.22)
-            holding = arms[1].draw(renderer).astype(int)
+        with arm.renderer(140, 180) as renderer:
+            hanging = arm.draw(renderer).astype(int)
+            arm.attach(0.22)
+            holding = arm.draw(renderer).astype(int)
     except RenderError as error:
         pytest.skip(str(error))
-    red, _, blue = np.moveaxis(hanging, -1, 0)
-    third = [hanging.shape[0] * k // 6 for k in (0, 3, 6)]
-    assert (red > blue + 60)[: third[1], 55:85].sum() > 300  # the upper two sections are not hidden
-    left, right = np.s_[third[1] :, :50], np.s_[third[1] :, 90:]
-    assert (blue > red + 60)[left].sum() > 100 and (red > blue + 60)[right].sum() > 100  # the containers
-    assert (blue > red + 60)[right].sum() == 0
     assert 10 < (np.abs(holding - hanging).max(axis=-1) > 40).sum() < 400  # the ball alone

@@ -10,8 +10,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
-from mjx_softarm.view.__main__ import main
-from mjx_softarm.view.errors import SCALE, SCALE_MM, Errors, colours
+from mjx_softarm.view.errors import Errors
 
 SPEC = ArmSpec.default()
 
@@ -45,11 +44,6 @@ def test_sets_come_back_and_others_are_refused(tmp_path):
         read_pose_pairs(tmp_path)
 
 
-def test_colours_stand_for_errors():
-    np.testing.assert_array_equal(colours(SCALE_MM), SCALE)
-    np.testing.assert_array_equal(colours(np.array([0.0, 500.0])), SCALE[[0, -1]])
-
-
 def test_run_is_followed_from_before_its_first_evaluation(server, run):
     page = Errors(server, run)
     page.refresh()
@@ -71,24 +65,11 @@ def test_run_is_followed_from_before_its_first_evaluation(server, run):
 
 def test_calibration_is_shown(server, tmp_path):
     SPEC.to_toml(tmp_path / "arm.toml")
-    write_pose_pairs(tmp_path, {"simulated": pairs(30.0), "with the network": pairs(2.0)})
     page = Errors(server, tmp_path)
+    page.refresh()
+    assert f"no {POSES_FILE} here: the logs had no poses" in page._text.content
+    write_pose_pairs(tmp_path, {"simulated": pairs(30.0), "with the network": pairs(2.0)})
     page.refresh()
     assert "the network extrapolates" in page._text.content and not hasattr(page, "_curve")
     hidden = [name for name, node in server.scene._handle_from_node_name.items() if not node.visible]
     assert {"/arm/tip/payload", "/arm/goal", "/arm/seen"} <= set(hidden)
-
-
-def test_folders_of_something_else_are_refused(run, tmp_path, capsys):
-    (tmp_path / "other").mkdir()
-    assert main([str(tmp_path / "other")]) == 2
-    assert "expected the folder of a run, with config.json, or of a calibration" in capsys.readouterr().err
-    assert main([str(run), str(run)]) == 2
-    assert "and more, expected one folder" in capsys.readouterr().err
-
-
-def test_a_calibration_without_poses_says_so(server, tmp_path):
-    SPEC.to_toml(tmp_path / "arm.toml")
-    page = Errors(server, tmp_path)
-    page.refresh()
-    assert f"no {POSES_FILE} here: the logs had no poses" in page._text.content

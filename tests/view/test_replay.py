@@ -1,12 +1,9 @@
 """Logs replayed and shared, without a browser."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.logs.schema import write_log
 from tests.linear_arm import GOALS, SPEC, LinearArm, go
 
@@ -28,17 +25,6 @@ def test_track_shows_the_row_of_a_time(path):
     assert track.at(-1.0).time_s == 0.0 and track.at(1e9).time_s == pytest.approx(1.98)
     assert track.at(0.51).time_s == pytest.approx(0.50)
     np.testing.assert_allclose(track.at(1.0).goal, GOALS[0], atol=1e-4)
-
-
-def test_the_path_that_is_asked_for_is_drawn(path, tmp_path, server, monkeypatch):
-    angle = np.linspace(0.0, 2 * np.pi, 50)
-    circle = np.tile(GOALS[0], (50, 1)) + 80.0 * np.stack([np.cos(angle), np.sin(angle)] + [0 * angle] * 4, 1)
-    log = read_matrix(path, SPEC)[0].log()
-    rows = np.arange(len(log)) // 2 % 50
-    write_log(tmp_path / "circle.csv", replace(log, goal=circle[rows]))
-    track = Timeline(tmp_path / "circle.csv", SPEC)
-    drawn = ReplayPage(server, SPEC, [track])._stages[0]._asked
-    assert drawn.visible and np.ptp(drawn.points, axis=0) == pytest.approx([0.16, 0.16, 0.0], abs=2e-3)
 
 
 def test_track_goes_without_rows_out_of_order(path, tmp_path):
@@ -73,13 +59,15 @@ def test_long_log_is_shared_faster(path, tmp_path, monkeypatch):
 
 
 def test_command_line(path, tmp_path, capsys):
+    (tmp_path / "other").mkdir()
     for words, message in (
         (("--html", tmp_path / "a.html"), "--html: got no log, expected one or more"),
         ((path, "--html", tmp_path / "no" / "a.html"), "expected a file in a folder that exists"),
         ((path, "--html", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .html or .htm"),
-        (("--log", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .csv or .npz or .mcap"),
         (("--demos", tmp_path / "a.mcap"), "a.mcap, expected a name that ends in .csv or .npz"),
         ((tmp_path / "no.csv",), "no.csv"),
+        ((tmp_path / "other",), "expected the folder of a run, with config.json, or of a calibration"),
+        ((tmp_path, tmp_path), "and more, expected one folder"),
     ):
         assert main([*map(str, words)]) == 2
         assert message in (error := capsys.readouterr().err) and error.count("\n") == 1

@@ -102,15 +102,3 @@ def test_a_weight_that_is_hardly_felt_tells_little_and_leaves_the_interval(arm):
 def test_a_weight_that_is_not_the_log_s_is_not_plausible(arm, weight_kg):
     poses = poses_with(arm, 1.0, 0.5, 20, 3)._replace(payload_kg=np.full(20, weight_kg))
     assert not fit_payload_scale(arm, poses, np.arange(20)).is_plausible
-
-
-def test_redundant_pressures_are_no_weight(four_chamber_arm):
-    at = payload_poses(CalibratedArm(four_chamber_arm), 40)
-    rng, n = np.random.default_rng(0), four_chamber_arm.n_chambers
-    left_kpa = 0.1 * rng.standard_normal(at.pressure_kpa.shape)
-    fit = fit_held_pressures(four_chamber_arm, at.spring_m, at.pressure_kpa + left_kpa, at.pressure_kpa)
-    kpa = at.pressure_kpa + 0.5 * at.effect_kpa_per_kg + 5.0 * np.tile([1.0, -1.0], n // 2)
-    m, none = len(kpa), np.empty(0)
-    poses = StaticPoses(kpa, np.full(m, 0.5), none, none, at.spring_m, none, none, np.ones(m))
-    found = fit_payload_scale(CalibratedArm(four_chamber_arm, held=fit.held), poses, np.arange(m))
-    assert found.ratio == pytest.approx(1.0, abs=0.05)

@@ -12,9 +12,8 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers import serial_line
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.drivers.serial_line import SerialArm
-from mjx_softarm.deploy.record import record
 from tests.arms import SIX_CHAMBERS
-from tests.linear_arm import REST_M, SPEC, LinearArm, N, read_m
+from tests.linear_arm import SPEC, LinearArm, N
 
 TIMEOUT_S = 0.5  # this machine may be busy
 
@@ -154,16 +153,6 @@ def test_line_that_cannot_be_sent_in_time_is_lost(monkeypatch):
         arm.send(1_000_000 * b"?")
     for end in ends:
         os.close(end)
-
-
-def test_recording_over_the_line(line, monkeypatch):
-    """The arm's time passes as pressures come, so the loop need not wait either."""
-    arm, controller = line
-    monkeypatch.setattr(type(arm), "time_s", property(lambda _: controller.arm.time_s), raising=False)
-    result = record(arm, SPEC, np.full((1, N), -5.0))
-    assert result.ending.cause == "" and len(result.log) == 1 and not controller.arm.command_kpa.any()
-    np.testing.assert_allclose(result.log.pressure_kpa, -5.0, atol=1e-4)
-    np.testing.assert_allclose(read_m(result.log), REST_M - 5.0 * 9e-4, atol=5e-5)
 
 
 def test_an_arm_by_its_settings(request, tmp_path):

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
-from mjx_softarm.spec import ArmSpec
+from tests.arms import SHORT
 from train.agent.analytic import Analytic, AnalyticConfig, GradientEpoch
 
-SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 N_ARMS, N_UPDATES = 32, 150
 CONFIG = AnalyticConfig(hidden=(32, 32), n_arms=N_ARMS)
 FEW = dataclasses.replace(CONFIG, n_arms=4)
@@ -111,11 +110,3 @@ def test_a_policy_is_adopted_and_may_observe_less():
     for other, given in (new(57, hidden=(8,)), new(19)):  # another size, and other things rather than less
         with pytest.raises(ValueError, match="actor: got layers of"):
             wider.adopt(state, other.parts(given))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("horizon", 0)]
-)
-def test_a_setting_out_of_range_is_named(name, value):
-    with pytest.raises(ValueError, match=f"learner.{name}: got {value}"):
-        dataclasses.replace(CONFIG, **{name: value})

@@ -7,7 +7,6 @@ import pytest
 
 from train.agent.imitation import goal_weights
 from train.agent.registry import epoch_of
-from train.epoch.devices import mesh_of
 from train.epoch.job import Job
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -72,25 +71,6 @@ def test_a_run_is_traced_once_and_continues_bit_for_bit_across_a_stage(job, run)
     resumed, _ = run(part, 4, 6)
     assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole), jax.device_get(resumed))
-
-
-@pytest.mark.slow  # test_devices.py asks it of `reach`
-def test_many_devices_learn_as_one_does_across_a_stage_and_a_balance(
-    imitation_config, short_env, shown, job, goals
-):
-    spread = Job(epoch_of(imitation_config.learner, short_env, mesh_of("8"), shown))
-    figures = []
-    for each in (job, spread):
-        state = each.init(jax.random.PRNGKey(5))
-        for epoch in range(6):
-            state = goals.begin_stage(state, epoch)
-            if epoch == 5:
-                state = goals.rebalance(state, epoch, np.arange(6.0))
-            state, metrics = each.epoch(each.place(state))
-        figures.append((jax.device_get(metrics), jax.device_get(each.policy(state))))
-    assert spread.n_traces == 1
-    for one, many in zip(*map(jax.tree.leaves, figures), strict=True):
-        np.testing.assert_allclose(many, one, rtol=1e-3, atol=1e-4)
 
 
 def test_goals_shift_to_the_positions_that_are_missed_by_most():

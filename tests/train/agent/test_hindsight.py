@@ -189,12 +189,6 @@ def test_shares_are_kept_and_the_rest_is_as_it_was(env, transition, relabelled):
     assert (given[kept] == -100.0).any()  # a saturated action that keeps its goal keeps its price
 
 
-@pytest.mark.parametrize("shares", [(-0.1, 0.5), (0.5, -0.1), (0.7, 0.4)])
-def test_shares_that_are_none_are_refused(shares):
-    with pytest.raises(ValueError, match="_share: got .*, expected"):
-        HindsightConfig(*shares)
-
-
 def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env, stored):
     n = len(stored.n_steps)
     before, after = jnp.full((n, 12), 2.0), jnp.full((n, 12), 3.0)

@@ -15,7 +15,7 @@ from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
-from tests.train.small import SHORT
+from tests.arms import SHORT
 from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import ImitationConfig
 from train.agent.networks import Actor

@@ -240,13 +240,3 @@ def test_a_batch_field_of_the_wrong_shape_is_named(agent, state, field):
     wrong = batch._replace(**{field: getattr(batch, field)[..., None]})
     with pytest.raises(ValueError, match=rf"Transition\.{field}: got shape .* expected "):
         agent.update(state, wrong, jax.random.key(0))
-
-
-BAD = {"hidden_critic": (), "n_critics": 0, "n_drop_per_critic": 25}
-BAD |= {"gamma": 1.5, "tau": 0.0, "initial_alpha": 0.0}
-
-
-@pytest.mark.parametrize(("field", "value"), BAD.items())
-def test_config_names_the_field_out_of_range(field, value):
-    with pytest.raises(ValueError, match=rf"learner\.{field}: got .* expected"):
-        TQCConfig(**{field: value})

@@ -6,10 +6,8 @@ import numpy as np
 import optax
 import pytest
 
-from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
-from train.agent.tqc import COST_AHEAD, Critics, PredictiveCritics, Predictor, TQCConfig
-from train.config import TrainConfig
+from train.agent.tqc import COST_AHEAD, Critics, PredictiveCritics, Predictor
 
 B, ACTION, SENSED = 64, 2, 5
 OBS = OBS_SIZE + SENSED
@@ -90,8 +88,3 @@ def test_the_quantiles_fall_with_the_predicted_errors(critics, params, batch):
     np.testing.assert_allclose(fall, np.broadcast_to(fall[:1], fall.shape), atol=1e-4)
     slope = jax.grad(lambda action: jnp.sum(critics.apply(blind, obs, action)))(action)
     assert jnp.all(jnp.linalg.norm(slope, axis=-1) > 0.0)
-
-
-def test_only_an_arm_in_motion_can_be_predicted():
-    with pytest.raises(ValueError, match=r"learner.n_ahead: got 4, expected 0 without env.observation"):
-        TrainConfig(learner=TQCConfig(n_ahead=4), env=EnvConfig())

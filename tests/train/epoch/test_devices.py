@@ -17,8 +17,9 @@ import pytest
 from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import ReachEnv
+from tests.arms import SHORT
 from tests.train import small
-from tests.train.small import SHORT, new_job
+from tests.train.small import new_job
 from train.__main__ import main
 from train.agent.registry import epoch_of
 from train.epoch.devices import mesh_of, split

@@ -11,7 +11,8 @@ from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
-from tests.train.small import CONFIG, SHORT, new_job
+from tests.arms import SHORT
+from tests.train.small import CONFIG, new_job
 from train.epoch.job import FreshPoses
 from train.runs.folder import Run
 

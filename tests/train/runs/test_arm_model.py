@@ -2,24 +2,13 @@
 
 import jax
 import numpy as np
-import pytest
 
 from calib.arm import CalibratedArm
 from mjx_softarm.policy.file import SHIPPED, load_policy
-from tests.train.small import SHORT, distil_little
 from train.runs import arm_model
-from train.runs.estimator import Distilled, Error, distil
+from train.runs.estimator import Distilled, Error
 
 POLICY = load_policy(SHIPPED)
-
-pytestmark = pytest.mark.usefixtures("quick_compiler")
-
-
-def test_same_seed_same_networks(monkeypatch):
-    distil_little(monkeypatch)
-    one, same = (jax.tree.leaves(distil(CalibratedArm(SHORT), 3)[:3]) for _ in range(2))
-    assert all(x.dtype == np.float32 for x in one)
-    assert all(np.array_equal(x, y) for x, y in zip(one, same, strict=True))
 
 
 def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, monkeypatch):

@@ -96,13 +96,6 @@ def test_a_damaged_checkpoint_is_called_so(saved, item, files, spoil):
         reopened.checkpoints.parts() if item == "parts" else reopened.checkpoints.restore(like)
 
 
-def test_a_checkpoint_of_other_sizes_is_called_another_version_s(saved):
-    run, like = saved
-    other = like._replace(learner={"other": like.learner["weight"]})
-    with pytest.raises(InputError, match="got a checkpoint of other parts or sizes"):
-        run.checkpoints.restore(other)
-
-
 def test_a_run_without_its_checkpoints_begins_anew_only_if_it_had_none(tmp_path):
     run = Run.create(tmp_path, CONFIG, ARM)
     for epoch in range(1, CONFIG.evaluation_epochs + 1):

@@ -144,14 +144,6 @@ def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, reward, left):
     np.testing.assert_array_equal(found.goal, goal)
 
 
-def test_an_evaluation_corrects_each_goal_of_a_path(short_env, actions, shift_limit):
-    goals = short_env.pool.pose[:64]
-    plain = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals))
-    corrected = plain.on(short_env, 1, shift_limit)
-    corrected.goals = jnp.concatenate([goals, goals])
-    assert (corrected(actions)[1].near_s == shift_limit[0]).all()
-
-
 def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():
     x = np.array([40.0, 20.0, 4.0, -8.0, -3.0, 1.0])  # near, beyond by 8 mm, near again
     way = jnp.asarray(np.stack([x, 0.0 * x, 0.0 * x], axis=-1))

@@ -45,7 +45,7 @@ def changed(env, **config):
 @pytest.mark.parametrize("pipe_mm", [None, 130.0], ids=["open", "narrower than the arm"])
 def test_positions_are_evaluated_with_body_and_pressures(short_env, evaluator, shown, pipe_mm):
     n = len(shown.positions)
-    figures, at = evaluator(changed(short_env, pipe_diameter_mm=pipe_mm))(0.0)
+    figures, at = evaluator(short_env).on(changed(short_env, pipe_diameter_mm=pipe_mm), 4)(0.0)
     assert figures.reached_share == 1.0 and figures.max_mm < 0.05 and len(figures.error_mm) == n
     assert (
         figures.success_share == (pipe_mm is None) and figures.outside_positions == (pipe_mm is not None) * n
@@ -69,8 +69,3 @@ def test_positions_with_saturation_or_a_body_outside_are_counted():
     figures, at = summarise(reached, 0.03, np.ones(4, bool))
     assert (figures.saturated_positions, figures.outside_positions, figures.unsettled) == (1, 1, 1)
     assert figures.success == (True, False, False, False) == tuple(at.success)
-
-
-def test_an_evaluation_at_rest_corrects_positions(short_env, evaluator, shift_limit):
-    found = evaluator(short_env).on(short_env, 1, shift_limit)(0.0)[1]
-    assert (found.reached.near_s == shift_limit[0]).all()
