@@ -8,7 +8,6 @@ import pytest
 from benchmarks.accuracy import calibration as logs
 from benchmarks.accuracy.calibration import planted_arm, read_asu, read_trunk
 from mjx_softarm.logs import checks
-from mjx_softarm.logs.checks import LogError
 
 DATA = Path(__file__).parents[3].parent / "shared/data"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the real logs are not beside the checkout")
@@ -73,23 +72,7 @@ def test_real_motion_has_next_to_no_outliers():
 @real
 @pytest.mark.parametrize(("name", "wire_mm"), [("apr5", 0.62), ("apr4", 0.25)])
 def test_real_draw_wires(name, wire_mm):
-    assert logs.wires(DATA, name)["fresh rows at rest"] <= wire_mm
-
-
-def test_files_that_are_not_such_logs(tmp_path):
-    names = [f"{axis}{disk}" for disk in (1, 2, 3) for axis in "xyz"] + [f"phi{k}" for k in range(1, 7)]
-    trunk, asu = tmp_path / "trunk.csv", tmp_path / "asu.txt"
-    np.savetxt(trunk, np.ones((4, 14)), "%g", ",", header=",".join(names[:4] + names[5:]), comments="")
-    with pytest.raises(LogError, match="trunk.csv: line 1: y2: got no such columns, expected"):
-        read_trunk(trunk)
-    table = np.ones((9, 38))
-    table[7, 4] = np.nan
-    np.savetxt(asu, table, "%g", ",")
-    with pytest.raises(LogError, match="asu.txt: line 8: measured0: got nan, expected a finite number"):
-        read_asu(asu)
-    np.savetxt(asu, table[:, :26], "%g", ",")
-    with pytest.raises(LogError, match="asu.txt: line 1: got 26 cells, expected 38"):
-        read_asu(asu)
+    assert logs.wires_error(DATA, name) <= wire_mm
 
 
 @pytest.mark.slow
