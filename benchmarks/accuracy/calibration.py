@@ -29,7 +29,6 @@ from calib.read.measurements import measure as measurements_of
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli
 from mjx_softarm.logs import checks
-from mjx_softarm.logs.schema import UNITS
 from mjx_softarm.sensing.s2r import correction
 
 ASU_LOGS = {name: f"asu_softarm/{name}_data_collect_1.txt" for name in ("apr5", "apr4")}
@@ -37,7 +36,6 @@ TRUNK_LOG = "asl_trunk/observations_controlled_{}.csv"
 STILL_M, STILL_S = 2e-3, 0.5  # the wires lag motion capture by a tenth of a second
 SEEDS = (0, 1, 2)
 N_NETWORKS = 5  # networks whose mean is judged, so that no one seed decides
-N_BODIES = 3
 WIRE_M_PER_V = 1.0 / 5.0  # draw-wire encoders: 5 V at 1 m, up to an offset that differs from day to day
 
 
@@ -99,9 +97,8 @@ def real_logs(data: Path) -> dict[str, Any]:
 def wires_error(data: Path, name: str) -> float:
     """Return the error [mm] from section 1's draw wires to its length, on fresh rows at rest."""
     log = read_asu(data / ASU_LOGS[name])
-    wire_m, length_m = log.wire_m[:, :2].mean(axis=1), log.section_m
-    rows = log.fresh & still_rows(log.time_s, wire_m) & still_rows(log.time_s, length_m)
-    return 1e3 * float(fit_line(wire_m[rows, None], length_m[rows, None]).held_out_rms[0])
+    rows = log.fresh & still_rows(log.time_s, log.wire_m) & still_rows(log.time_s, log.section_m)
+    return 1e3 * float(fit_line(log.wire_m[rows, None], log.section_m[rows, None]).held_out_rms[0])
 
 
 def still_rows(time_s: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -132,7 +129,7 @@ def trunk_across(data: Path, log: str, asked: str) -> dict[str, float]:
 def _trunk(data: Path, log: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return motor angles (n, 6) [deg], tips (n, 3) [mm], and whether they are fresh (n,)."""
     trunk = read_trunk(data / TRUNK_LOG.format(log))
-    return motor_angles(trunk.motor_deg), 1e3 * trunk.position_m[:, -1], trunk.fresh
+    return motor_angles(trunk.motor_deg), 1e3 * trunk.tip_m, trunk.fresh
 
 
 def _trunk_errors(x: np.ndarray, tip_mm: np.ndarray, train: np.ndarray, test: np.ndarray) -> dict[str, float]:
@@ -174,27 +171,19 @@ def polynomial(x: np.ndarray, y: np.ndarray, train: np.ndarray, degree: int) -> 
 
 
 class AsuLog(NamedTuple):
-    """Log of the two-section pneumatic arm of ASU RISE."""
+    """First section of the two-section pneumatic arm of ASU RISE."""
 
     time_s: np.ndarray  # (n,)
-    pressure_kpa: np.ndarray  # (n, 6) measured in section 1, then section 2, relative to the atmosphere
-    wire_m: np.ndarray  # (n, 4) draw wires from the base: section 1 left, 1 right, 2 right, 2 left
-    position_m: np.ndarray  # (n, 3, 3) base, middle, tip
-    quaternion: np.ndarray  # (n, 3, 4) w, x, y, z as logged
+    wire_m: np.ndarray  # (n,) mean of its two draw wires, from the base
+    section_m: np.ndarray  # (n,) from its base to its end
     fresh: np.ndarray  # (n,) whether every body has moved since the row before
-
-    @property
-    def section_m(self) -> np.ndarray:
-        """Length (n,) [m] of the first section, from its base to its end."""
-        return np.linalg.norm(self.position_m[:, 1] - self.position_m[:, 0], axis=1)
 
 
 class TrunkLog(NamedTuple):
     """Log of the three-segment tendon-driven trunk of Stanford ASL."""
 
     motor_deg: np.ndarray  # (n, 6) measured
-    position_m: np.ndarray  # (n, 3, 3) disks from the base, the last being the tip; y up
-    quaternion: np.ndarray | None  # (n, 3, 4) w, x, y, z as logged
+    tip_m: np.ndarray  # (n, 3) y up
     fresh: np.ndarray  # (n,) whether the tip has moved since the row before
 
 
@@ -205,28 +194,17 @@ def read_asu(path: Path) -> AsuLog:
     four draw wires [V], and for base, middle and tip the position and the quaternion, scalar last.
     """
     values = np.loadtxt(path, delimiter=",")
-    psi = values[:, 1:13].reshape(-1, 2, 2, 3)[:, :, 1].reshape(-1, 6)
-    body = values[:, 17:].reshape(-1, N_BODIES, 7)
+    base, middle, tip = np.split(values[:, 17:], 3, axis=1)
+    section_m = np.linalg.norm((middle - base)[:, :3], axis=1)
+    stale = [checks.stale_rows(body) for body in (base, middle, tip)]
     return AsuLog(
-        time_s=values[:, 0],
-        pressure_kpa=UNITS["pressure"]["psi"] * psi,
-        wire_m=WIRE_M_PER_V * values[:, 13:17],
-        position_m=body[..., :3],
-        quaternion=body[..., [6, 3, 4, 5]],
-        fresh=~np.any([checks.stale_rows(body[:, k]) for k in range(N_BODIES)], axis=0),
+        values[:, 0], WIRE_M_PER_V * values[:, 13:15].mean(axis=1), section_m, ~np.any(stale, axis=0)
     )
 
 
 def read_trunk(path: Path) -> TrunkLog:
-    """Read one `observations_controlled_*.csv`, with or without quaternions."""
+    """Read one `observations_controlled_*.csv`."""
     table = np.genfromtxt(path, delimiter=",", names=True)
-
-    def columns(*parts: str) -> np.ndarray:
-        """Return the columns (n, 3, len(parts)) of each disk."""
-        names = [f"{part}{disk}" for disk in range(1, N_BODIES + 1) for part in parts]
-        return np.stack([table[name] for name in names], axis=1).reshape(-1, N_BODIES, len(parts))
-
+    tip_m = np.stack([table[name] for name in ("x3", "y3", "z3")], axis=1)
     motor_deg = np.stack([table[f"phi{k}"] for k in range(1, 7)], axis=1)
-    position_m = columns("x", "y", "z")
-    quaternion = columns("w", "qx", "qy", "qz") if "w1" in (table.dtype.names or ()) else None
-    return TrunkLog(motor_deg, position_m, quaternion, ~checks.stale_rows(position_m[:, -1]))
+    return TrunkLog(motor_deg, tip_m, ~checks.stale_rows(tip_m))

@@ -17,7 +17,7 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -107,8 +107,19 @@ class Paper:
     out: cli.MaybePath = None
 
     def __call__(self) -> int:
-        """Run the experiments, print and write their figures; return the exit status."""
-        settings = self.settings()
+        """Run the experiments, print and write their figures; return the exit status.
+
+        Raises:
+            InputError: the options do not go together.
+        """
+        if self.only != "open" and self.arm == "rod":
+            raise InputError(f"--only: got {self.only}, expected open with --arm rod")
+        if self.beside and self.smoke:
+            raise InputError(f"--beside: got {' '.join(self.beside)}, expected none with --smoke")
+        given = {"twins": self.twins, "seeds": self.seeds, "loads_g": self.loads}
+        chosen = {name: value for name, value in given.items() if value is not None}
+        size = SMOKE if self.smoke else Settings()
+        settings = dataclasses.replace(size, arm=self.arm, beside=self.beside, **chosen)
         folder = self.out or Path("runs/paper-smoke" if self.smoke else "runs/paper")
         claim(folder, {k: v for k, v in dataclasses.asdict(settings).items() if k not in MORE})
         results, status = folder if self.smoke else RESULTS, 0
@@ -125,22 +136,6 @@ class Paper:
                 except RenderError as error:
                     print(f"no film: {error}")
         return 0 if self.smoke else status
-
-    def settings(self) -> Settings:
-        """Return the settings that these options choose.
-
-        Raises:
-            InputError: the options do not go together.
-        """
-        if self.only != "open" and self.arm == "rod":
-            raise InputError(f"--only: got {self.only}, expected open with --arm rod")
-        if self.beside and self.smoke:
-            raise InputError(f"--beside: got {','.join(self.beside)}, expected none with --smoke")
-        given = {"twins": self.twins, "seeds": self.seeds, "loads_g": self.loads}
-        chosen = {name: value for name, value in given.items() if value is not None}
-        return dataclasses.replace(
-            SMOKE if self.smoke else Settings(), arm=self.arm, beside=self.beside, **chosen
-        )
 
 
 def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
@@ -287,24 +282,16 @@ def export(folder: Path, settings: Settings, twin: int | None, policies: tuple[s
 
 
 def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
-    """Run a trial, and save its log and its figures."""
+    """Run a trial, and save its figures and, where it is drawn over time, its log."""
     figures, log = operate(*scene_of(folder, settings, trial), trial)
     (folder / trial.log).parent.mkdir(exist_ok=True)
-    write_log(folder / trial.log, log)
+    if trial.logged:
+        write_log(folder / trial.log, log)
     write_json(folder / trial.result, {**trial._asdict(), "variant": trial.variant, **figures})
 
 
-class Scene(NamedTuple):
-    """Inputs of a trial."""
-
-    twin: Any
-    controller: Controller
-    goals: np.ndarray  # (p, 6) [mm, deg]
-    names: list[str]  # of the goals, such as "pick left"; "" on the circle
-
-
-def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
-    """Return the scene of a trial: its twin, in its pipe if it has one, its controller and its goals."""
+def scene_of(folder: Path, settings: Settings, trial: Trial) -> tuple[Any, Controller, np.ndarray, list[str]]:
+    """Return a trial's twin, in its pipe if it has one, its controller, its goals (p, 6) and their names."""
     controller, task = controller_of(folder, trial), KINDS[trial.kind].task
     spec = controller.policy.spec
     inside: dict[str, Any] = {"session": EVALUATION_SESSION, "payload_kg": 1e-3 * trial.load_g}
@@ -316,7 +303,7 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
     else:
         goals = circle_poses(spec, N_IN_TIME if trial.lap_s else settings.n_points).astype(float)
         names = [""] * len(goals)
-    return Scene(STAND_INS[settings.arm](trial.twin, **inside), controller, goals, names)
+    return STAND_INS[settings.arm](trial.twin, **inside), controller, goals, names
 
 
 def controller_of(folder: Path, trial: Trial) -> Controller:

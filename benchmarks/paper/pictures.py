@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from benchmarks.harness.common import Row, grouped
-from benchmarks.paper.trial import WatchedTwin, finger_tips, operate
+from benchmarks.paper.trial import finger_tips, operate, watch
 from benchmarks.paper.trials import KINDS, Settings, Trial
 from mjx_softarm.control import Gains
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.pipe import PIPES, CrossPipe
 from mjx_softarm.sensing.pose import frame_from_pose
@@ -23,20 +24,16 @@ from train.runs.plots import BLUE, GREY, INK, ORANGE, dress
 
 GREEN, RED = "#2a9d6f", "#c43333"
 COLOURS = {"without": ORANGE, "with": BLUE, "gradient": GREEN}  # of the kinds on the circle
+PAPER_LOADS = (35, 500, 1000), (9.0, 9.0, 23.76)  # [g], [mm] of the paper's arm
 WIDTH, HEIGHT = 240, 320  # of a picture of a film [px]
 PERIOD_S = 1.0  # simulated time between two pictures
-MAX_FRAMES, FRAMES_PER_S = 120, 12
+MAX_FRAMES, FRAME_MS, N_COLOURS = 120, 80, 128
 
 
 def circle_figure(rows: Sequence[Row], at_stops: Sequence[Row], settings: Settings) -> Figure:
     """Draw the circle from above, reference and path of each kind: a panel for each arm, its first seed.
 
-    Points at which a chamber is saturated are ringed.
-
-    Args:
-        rows: figures of each trial.
-        at_stops: goals, errors and saturation of each trial.
-        settings: of the experiment.
+    Points at which a chamber is saturated are ringed. `at_stops` are those of `trial.operate` of each trial.
     """
     n_twins = len(settings.twins)
     figure = Figure(figsize=(4.0 * n_twins + 0.6, 5.8 if n_twins == 1 else 5.1), layout="constrained")
@@ -69,15 +66,10 @@ def _closed(points: np.ndarray) -> np.ndarray:
     return np.vstack([points, points[:1]]).T
 
 
-def loads_figure(rows: Sequence[Row], arm: str, paper_mm: Sequence[tuple[float, float]]) -> Figure:
+def loads_figure(rows: Sequence[Row], arm: str) -> Figure:
     """Draw the mean error on the circle over the payload, a line for each policy that carries payloads.
 
     Dots are single runs, bars end at the largest error of a policy's runs.
-
-    Args:
-        rows: figures of each trial.
-        arm: stand-in.
-        paper_mm: payload [g] and error [mm] of the paper's arm.
     """
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     panel = figure.subplots()
@@ -91,7 +83,7 @@ def loads_figure(rows: Sequence[Row], arm: str, paper_mm: Sequence[tuple[float, 
         panel.plot([r["load_g"] for r in runs], [r["translation_mm"] for r in runs], ".", color=f"C{k}")
         panel.plot(list(by_load), mean, color=f"C{k}", label=KINDS[kind].title)
         panel.vlines(list(by_load), mean, largest, color=f"C{k}", alpha=0.35)
-    panel.plot(*np.transpose(paper_mm), "x--", color=GREY, label="the paper's arm: mean; at 1 kg largest")
+    panel.plot(*PAPER_LOADS, "x--", color=GREY, label="the paper's arm: mean; at 1 kg largest")
     panel.legend(frameon=False, fontsize=8)
     return figure
 
@@ -133,13 +125,13 @@ def traces_figure(logs: Mapping[int, Log], spec: ArmSpec) -> Figure:
     return figure
 
 
-def film(path: Path, scene: Any, trial: Trial) -> None:
+def film(path: Path, scene: tuple[Any, Controller, np.ndarray, list[str]], trial: Trial) -> None:
     """Run a trial and write its film: the twin at equal times beside its path.
 
     The path is that of the tip from above, or in a pipe that of the finger tips from the front.
     """
     # Run the trial.
-    twin, controller, goals, names = scene
+    twin, controller, goals, _ = scene
     pipe = PIPES.get(KINDS[trial.kind].task)
     gripper_m = controller.policy.spec.mass.gripper_length_m if pipe else 0.0
     pictures, tips_m = [], []
@@ -151,10 +143,11 @@ def film(path: Path, scene: Any, trial: Trial) -> None:
                 tip_m, rotation = twin.tip()
                 tips_m.append(finger_tips(tip_m, rotation, gripper_m))
 
-        operate(WatchedTwin(twin, shoot), controller, goals, names, trial)
+        watch(twin, shoot)
+        operate(*scene, trial)
     # Draw the goals, and the pipe cut open.
     figure = Figure(figsize=(4.8, 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(figure)
     view, side = figure.subplots(1, 2)
     axes = [0, 2 if pipe else 1]
     path_mm = 1e3 * np.array(tips_m)[:, axes]
@@ -170,14 +163,18 @@ def film(path: Path, scene: Any, trial: Trial) -> None:
     (line,) = side.plot(*path_mm.T, color=BLUE)
     (end,) = side.plot([], [], "o", color=ORANGE)
 
-    def draw(k: int) -> Any:
+    images = []
+    n = len(pictures)
+    for k in np.unique(np.linspace(0, n - 1, min(MAX_FRAMES, n)).round().astype(int)).tolist():
         image.set_data(pictures[k])
         line.set_data(*path_mm[: k + 1].T)
         end.set_data(*path_mm[k : k + 1].T)
-        return image, line, end
-
-    frames = np.unique(np.linspace(0, len(pictures) - 1, min(MAX_FRAMES, len(pictures))).round().astype(int))
-    FuncAnimation(figure, draw, frames.tolist()).save(path, PillowWriter(FRAMES_PER_S))
+        canvas.draw()
+        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+    # One palette for all frames makes a small file.
+    palette = images[len(images) // 2].quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE)
+    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in images)
+    first.save(path, save_all=True, append_images=others, duration=FRAME_MS, loop=0, optimize=True)
 
 
 def outline_mm(pipe: CrossPipe) -> list[np.ndarray]:

@@ -31,19 +31,15 @@ CALM_N = 1.0  # contact force that counts as none
 OBJECTS_KG = {"as shown": (BALL_KG, APPLE_KG), "exchanged": (APPLE_KG, BALL_KG)}
 
 
-class WatchedTwin:
-    """A twin that calls a function each time it has been driven; all else is the twin's own."""
+def watch(twin: Any, on_driven: Callable[[], None]) -> None:
+    """Let a twin call a function each time that it has been driven."""
+    drive = twin.write_pressures
 
-    def __init__(self, twin: Any, on_driven: Callable[[], None]):
-        self._twin, self._on_driven = twin, on_driven
+    def write_pressures(pressure_kpa: np.ndarray) -> None:
+        drive(pressure_kpa)
+        on_driven()
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._twin, name)
-
-    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
-        """Drive the twin; see `ArmIO`."""
-        self._twin.write_pressures(pressure_kpa)
-        self._on_driven()
+    twin.write_pressures = write_pressures
 
 
 class Gripper:
@@ -124,18 +120,18 @@ def operate(
         forces_n.append(force()[0])
         gripper.hang()
 
-    watched: Any = WatchedTwin(twin, note)
+    watch(twin, note)
     # Run the loop, with or without stops.
     passed = np.char.startswith(names, "to ") & trial.moves | bool(trial.lap_s)
     passed[[0, -1]] = False
     stops = np.flatnonzero(~passed)
     if trial.moves or trial.lap_s:
         pace_s = trial.lap_s / (len(goals) - 1) if trial.lap_s else PACE_S
-        run = trace(watched, controller, goals, pace_s, ~passed, arrived=gripper.operate)
+        run = trace(twin, controller, goals, pace_s, ~passed, arrived=gripper.operate)
         arrivals = (a._replace(index=int(np.searchsorted(stops, a.index))) for a in run.arrivals)
         run = run._replace(arrivals=tuple(arrivals))
     else:
-        run = follow(watched, controller, goals, arrived=gripper.operate)
+        run = follow(twin, controller, goals, arrived=gripper.operate)
     if not len(run.log):
         cause = run.ending.cause or "all were refused"
         raise InputError(f"goals: got {len(goals)} and no tick of the loop: {cause}, expected one to go to")

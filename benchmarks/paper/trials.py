@@ -127,6 +127,11 @@ class Trial(NamedTuple):
         """File of the log, in the folder."""
         return self.result.replace(".json", "-log.npz")
 
+    @property
+    def logged(self) -> bool:
+        """Whether the log is kept, to be drawn over time."""
+        return self.kind == "with" and self.load_g in TRACED_G and not self.lap_s
+
 
 def trials(experiment: str, settings: Settings) -> list[Trial]:
     """Return the trials of "open" or "confined"."""
