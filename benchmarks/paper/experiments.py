@@ -15,7 +15,6 @@ import dataclasses
 import itertools
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -77,8 +76,16 @@ FILMS = {
 }
 
 
-@dataclass(frozen=True)
-class Paper:
+def paper(
+    smoke: bool = False,
+    only: Literal["open", "confined", "independence"] | None = None,
+    twins: cli.Integers | None = None,
+    seeds: cli.Integers | None = None,
+    loads: cli.Integers | None = None,
+    arm: Literal["twin", "rod"] = "twin",
+    beside: tuple[Annotated[str, cli.one_of(BESIDE)], ...] = (),
+    out: cli.MaybePath = None,
+) -> int:
     """How close does the paper's method come on simulated stand-ins for an arm? Takes hours.
 
     The exit status is 1 if a target is missed.
@@ -95,47 +102,32 @@ class Paper:
         arm: twin, or a rod, of other physics, in open space alone
         beside: further presets in open space, beside analytic
         out: working folder; None: runs/paper
+
+    Raises:
+        InputError: the options do not go together.
     """
-
-    smoke: bool = False
-    only: Literal["open", "confined", "independence"] | None = None
-    twins: cli.Integers | None = None
-    seeds: cli.Integers | None = None
-    loads: cli.Integers | None = None
-    arm: Literal["twin", "rod"] = "twin"
-    beside: tuple[Annotated[str, cli.one_of(BESIDE)], ...] = ()
-    out: cli.MaybePath = None
-
-    def __call__(self) -> int:
-        """Run the experiments, print and write their figures; return the exit status.
-
-        Raises:
-            InputError: the options do not go together.
-        """
-        if self.only != "open" and self.arm == "rod":
-            raise InputError(f"--only: got {self.only}, expected open with --arm rod")
-        if self.beside and self.smoke:
-            raise InputError(f"--beside: got {' '.join(self.beside)}, expected none with --smoke")
-        given = {"twins": self.twins, "seeds": self.seeds, "loads_g": self.loads}
-        chosen = {name: value for name, value in given.items() if value is not None}
-        size = SMOKE if self.smoke else Settings()
-        settings = dataclasses.replace(size, arm=self.arm, beside=self.beside, **chosen)
-        folder = self.out or Path("runs/paper-smoke" if self.smoke else "runs/paper")
-        claim(folder, {k: v for k, v in dataclasses.asdict(settings).items() if k not in MORE})
-        results, status = folder if self.smoke else RESULTS, 0
-        for experiment in [self.only] if self.only else EXPERIMENTS:
-            run_stages(folder, settings, stages(experiment, settings))
-            figures = write_report(experiment, folder, results, settings)
-            show({name: figures[name] for name in ("spreads", "targets") if name in figures}, experiment)
-            status |= status_of(figures)
-            if experiment in FILMS and self.arm == "twin":  # a rod cannot be drawn
-                name, kind, objects = FILMS[experiment]
-                trial = Trial(kind, settings.twins[0], settings.seeds[0], objects)
-                try:
-                    film(results / name, scene_of(folder, settings, trial), trial)
-                except RenderError as error:
-                    print(f"no film: {error}")
-        return 0 if self.smoke else status
+    if only != "open" and arm == "rod":
+        raise InputError(f"--only: got {only}, expected open with --arm rod")
+    given = {"twins": twins, "seeds": seeds, "loads_g": loads}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    size = SMOKE if smoke else Settings()
+    settings = dataclasses.replace(size, arm=arm, beside=beside, **chosen)
+    out = out or Path("runs/paper-smoke" if smoke else "runs/paper")
+    claim(out, {name: value for name, value in dataclasses.asdict(settings).items() if name not in MORE})
+    results, status = out if smoke else RESULTS, 0
+    for experiment in [only] if only else EXPERIMENTS:
+        run_stages(out, settings, stages(experiment, settings))
+        figures = write_report(experiment, out, results, settings)
+        show({name: figures[name] for name in ("spreads", "targets") if name in figures}, experiment)
+        status |= status_of(figures)
+        if experiment in FILMS and settings.arm == "twin":  # a rod cannot be drawn
+            name, kind, objects = FILMS[experiment]
+            trial = Trial(kind, settings.twins[0], settings.seeds[0], objects)
+            try:
+                film(results / name, scene_of(out, settings, trial), trial)
+            except RenderError as error:
+                print(f"no film: {error}")
+    return 0 if smoke else status
 
 
 def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
