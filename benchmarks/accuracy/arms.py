@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from benchmarks.harness.common import target
+from benchmarks.harness.common import names_of, target
 from benchmarks.harness.peers import peer_python
 from benchmarks.harness.stages import EVALUATION_FILE, WorkStage, claim, command, run_stages, train
 from mjx_softarm._support import cli
@@ -72,7 +72,7 @@ class ArmSettings(NamedTuple):
 
 
 def measure(
-    arms: tuple[Annotated[str, cli.one_of(ARMS)], ...] = tuple(name for name in ARMS if not ARMS[name].peer),
+    arms: Annotated[tuple[str, ...], names_of(ARMS)] = tuple(name for name in ARMS if not ARMS[name].peer),
     poses: int = 300,
     preset: str = "analytic",
     steps: int | None = None,

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness.common import over_runs
+from benchmarks.harness.common import names_of, over_runs
 from benchmarks.harness.stages import EVALUATION_FILE, WorkStage, claim, run_stages, train
 from mjx_softarm._support import cli, xla
 from mjx_softarm.logs.schema import Log, write_log
@@ -63,7 +63,7 @@ CASES = {
 def measure(
     out: Path = Path("runs/printed"),
     seeds: cli.Integers = (0, 1, 2),
-    cases: tuple[Annotated[str, cli.one_of(CASES)], ...] = tuple(CASES),
+    cases: Annotated[tuple[str, ...], names_of(CASES)] = tuple(CASES),
     env_steps: int | None = None,
 ) -> dict[str, Any]:
     """Does the paper's recipe work as printed, in simulation, and what does each change to it bring?

@@ -18,7 +18,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+from tyro.constructors import PrimitiveConstructorSpec
 
+from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import provenance, write_json
 
 RESULTS = Path(__file__).parents[2] / "docs/results"
@@ -43,6 +45,19 @@ def cpu_kind() -> str:
 def machine_kind() -> str:
     """Return the name of the GPU if JAX runs on one, else `cpu_kind`."""
     return jax.devices()[0].device_kind if jax.default_backend() == "gpu" else cpu_kind()
+
+
+def names_of(known: Iterable[str]) -> PrimitiveConstructorSpec:
+    """Return the reader of an option whose value is some known names with commas between them."""
+    known = tuple(known)
+
+    def read(words: list[str]) -> tuple[str, ...]:
+        names = tuple(dict.fromkeys(words[0].split(",")))
+        if unknown := [name for name in names if name not in known]:
+            raise ValueError(f"got {', '.join(unknown)}, expected some of {', '.join(known)}")
+        return names
+
+    return cli.listed(read, "NAME,NAME,...")
 
 
 def target(text: str, measured: str, met: bool | None) -> dict[str, str]:

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from benchmarks.harness.common import RESULTS, show, status_of
+from benchmarks.harness.common import RESULTS, names_of, show, status_of
 from benchmarks.harness.stages import EVALUATION_FILE, WorkStage, claim, command, run_stages, train
 from benchmarks.paper import independence
 from benchmarks.paper.gradient_descent import gradient_descent
@@ -83,7 +83,7 @@ def paper(
     seeds: cli.Integers | None = None,
     loads: cli.Integers | None = None,
     arm: Literal["twin", "rod"] = "twin",
-    beside: tuple[Annotated[str, cli.one_of(BESIDE)], ...] = (),
+    beside: Annotated[tuple[str, ...], names_of(BESIDE)] = (),
     out: cli.MaybePath = None,
 ) -> int:
     """How close does the paper's method come on simulated stand-ins for an arm? Takes hours.

@@ -15,6 +15,7 @@ from typing import Any
 
 from benchmarks.harness.common import machine_kind
 from benchmarks.harness.stages import EVALUATION_FILE, command
+from benchmarks.speed.jax_worker import mesh_of_cores
 from benchmarks.speed.throughput import rows_of
 from mjx_softarm._support import cli
 from train.sweep import open_members
@@ -57,6 +58,7 @@ def measure(keep: cli.MaybePath = None) -> dict[str, Any]:
     Args:
         keep: folder for the runs; without one they are deleted
     """
+    mesh_of_cores(1)  # devices are made before JAX is used
     with tempfile.TemporaryDirectory() as folder:
         home = (keep or Path(folder)).absolute()
         home.mkdir(parents=True, exist_ok=True)

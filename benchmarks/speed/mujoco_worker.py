@@ -3,8 +3,8 @@
     python -m benchmarks.speed.mujoco_worker subproc N_PROCESSES    Stable-Baselines3's SubprocVecEnv
     python -m benchmarks.speed.mujoco_worker rollout N_THREADS      MuJoCo's own threaded rollout
 
-A step holds random references until the arm rests. Observation and reward are left out: beside some 25 ms of
-physics they take no time. Both report where the arms stopped.
+A step holds the references of a random action until the arm rests. Observation and reward are left out:
+beside some 25 ms of physics they take no time. Both report where the arms stopped.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks.harness.rounds import Facts, serve
 from benchmarks.speed.mujoco_arms import SteppedArms, SteppedEnv, SteppedRest
+from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.spec import ArmSpec
 
 ROUND_S = 5.0
@@ -27,11 +28,11 @@ TIMESTEP_S = SteppedArms(SPEC, 1, 0).timestep_s
 
 def timed(step: Callable[[np.ndarray], SteppedRest], n: int, rng: np.random.Generator) -> Facts:
     """Step n arms for `ROUND_S`; return rates, references, and tips where the arms stopped."""
-    low_m, high_m = map(SPEC.at_springs, (SPEC.springs.length_min_m, SPEC.springs.length_max_m))
+    lengths = ActionMap.from_spec(SPEC).lengths
     references, ends = [], []
     start = time.perf_counter()
     while (spent := time.perf_counter() - start) < ROUND_S:
-        references.append(rng.uniform(low_m, high_m, (n, SPEC.n_springs)))
+        references.append(lengths(rng.uniform(-1.0, 1.0, (n, SPEC.n_springs))))
         ends.append(step(references[-1]))
     return {
         "env_steps_per_s": n * len(ends) / spent,

@@ -76,7 +76,8 @@ def measure(
         if not pairs:
             raise InputError(f"--engine: got {' '.join(engine)}, expected one with --mode {' '.join(mode)}")
         xla.enable_compilation_cache()
-        mesh_of_cores(1)  # devices are made before JAX is used
+        if not train:
+            mesh_of_cores(1)  # devices are made before JAX is used
         sizes = arms or (64, 1024, 8192, *((65_536,) if jax.default_backend() == "gpu" else ()))
         rows = rows_of([(*pair, n) for n in sizes for pair in pairs], seconds, train)
         figures = {"machine": machine_kind(), "seconds": seconds, "train": train, "rows": rows}

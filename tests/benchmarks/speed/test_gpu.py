@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.harness import common
-from benchmarks.speed import gpu
+from benchmarks.speed import gpu, throughput
 from train.config import override
 from train.presets import PRESETS
 
@@ -34,6 +34,8 @@ def test_the_sizes_of_a_training_fit_each_other(preset):
 @pytest.mark.slow
 def test_smoke(tmp_path, monkeypatch):
     monkeypatch.setattr(common, "RESULTS", tmp_path)
+    for module in (gpu, throughput):  # JAX has been used: no more devices
+        monkeypatch.setattr(module, "mesh_of_cores", lambda n: None)
     monkeypatch.setattr(gpu, "STEPS", {("chain", "quasistatic"): (8,)})
     tiny = {"learner.n-arms": 16, "learner.total-env-steps": 1024, "env.n-poses": 256}
     monkeypatch.setattr(gpu, "TRAININGS", {"analytic": ("0,1", tiny)})
