@@ -52,7 +52,7 @@ class Target(NamedTuple):
         rows = [row for row in table if self._includes(row)]
         bound = f"at {'least' if self.at_least else 'most'} {self.limit:.3g}"
         where = ", ".join([KINDS[self.kind].title if self.kind else "all kinds", *self.variants])
-        relative = f", of that with {KINDS[self.of[0]].title}, {self.of[1]}" if self.of else ""
+        relative = f" over the mean of {KINDS[self.of[0]].title}, {self.of[1]}" if self.of else ""
         text = f"{where}: {self.over.__name__} of {self.figure}{relative}: {bound}"
         others = [row[self.figure] for row in table if (row["kind"], row["variant"]) == self.of]
         if not rows or (self.of and not others):

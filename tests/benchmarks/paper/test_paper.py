@@ -222,7 +222,7 @@ S2R, GRADIENT, PIPE_SHOWN = "with S2R, 0 g: ", "gradient descent, 0 g: ", "learn
             {PIPE._replace(moves=True): {"calm": 95.0}},
             ["learned reward, as shown in motion: min"],
         ),
-        ("confined", {PIPE: {"seconds": 2.0}}, ["learned reward, as shown in motion: mean of seconds, of"]),
+        ("confined", {PIPE: {"seconds": 2.0}}, ["learned reward, as shown in motion: mean of seconds over"]),
         ("confined", {Trial("narrowest", 0, 0, "as shown"): {"mm": 99.0, "fails": 4}}, []),  # no target
     ],
 )
