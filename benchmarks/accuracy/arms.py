@@ -19,7 +19,6 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.fields import scaled
 from mjx_softarm.spec import ArmSpec
 
-N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
 
 # Turns [deg] of the base. An arm that stands must do so without pressure, before it is calibrated: the arm of
@@ -120,11 +119,10 @@ def take(out: Path, settings: ArmSettings, arm: str) -> None:
             command(folder / "commands.log", *words, makes=made, python=python)
 
     # Record, calibrate, train and export
-    logs = {folder / "poses.npz": (settings.poses,), folder / "moving.npz": (N_MOVING, "--transients")}
-    record = ("mjx_softarm.deploy", "record", *stand_in, "--spec", file)
-    for log, options in logs.items():
-        ensure(log, *record, "--poses", *options, "--out", log, python=python)
-    ensure(calibration / "report.json", "calib", "run", *logs, "--spec", file, "--out", calibration)
+    log = folder / "poses.npz"
+    record = ("mjx_softarm.deploy", "record", *stand_in, "--spec", file, "--poses", settings.poses)
+    ensure(log, *record, "--out", log, python=python)
+    ensure(calibration / "report.json", "calib", "run", log, "--spec", file, "--out", calibration)
     steps = ("--learner.total-env-steps", settings.steps) if settings.steps else ()
     if not (run / EVALUATION_FILE).exists():
         train(run, "reach", "--preset", settings.preset, "--calibration", calibration, *steps)

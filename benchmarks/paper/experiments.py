@@ -65,7 +65,6 @@ from train.demos.demonstrations import load_demonstrations
 from train.demos.waypoints import task as task_of
 
 STAND_INS = {"twin": Twin, "rod": RodTwin}
-N_MOVING = 8  # poses of a rod's log of all ticks, to which its slow regulators are fitted
 # Session of a twin in trials of demonstrated tasks. Demonstrations are recorded in its evaluation session,
 # with other noise.
 TRIAL_SESSION = 2
@@ -199,24 +198,22 @@ def _export(twin: int | None, keys: Iterable[tuple[str, int | None, int]]) -> Wo
 
 
 def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
-    """Record a twin's logs, and calibrate the twin by their files, as a user would.
+    """Record a twin, and calibrate it by the log's file, as a user would.
 
     Raises:
         InputError: the recording ended early.
     """
     home, spec = folder / arm_name(twin), ArmSpec.default()
     home.mkdir(parents=True, exist_ok=True)
-    n_of_logs = {"log.npz": settings.n_poses} | ({"moving.npz": N_MOVING} if settings.arm == "rod" else {})
-    for name, n in n_of_logs.items():
-        arm: Any = STAND_INS[settings.arm](twin, spec, session=S2R_SESSION)
-        recording = record(arm, spec, random_pressures(spec, n, seed=twin), transients=name == "moving.npz")
-        if cause := recording.ending.cause:
-            raise InputError(f"log of {n} poses: got a recording that ended early ({cause}), expected all")
-        write_log(home / name, recording.log)
-    logs, findings = zip(*(read_log(home / name, spec) for name in n_of_logs), strict=True)
+    arm: Any = STAND_INS[settings.arm](twin, spec, session=S2R_SESSION)
+    recording = record(arm, spec, random_pressures(spec, settings.n_poses, seed=twin))
+    if cause := recording.ending.cause:
+        raise InputError(f"log of twin {twin}: got a recording that ended early ({cause}), expected all")
+    write_log(home / "log.npz", recording.log)
+    log, findings = read_log(home / "log.npz", spec)
     xla.enable_compilation_cache()
-    lines = [str(finding) for finding in itertools.chain(*findings)]
-    write_calibration(home / CALIBRATION, calibrate(logs, spec), lines, provenance("benchmarks"))
+    lines = [str(finding) for finding in findings]
+    write_calibration(home / CALIBRATION, calibrate([log], spec), lines, provenance("benchmarks"))
 
 
 def reach(folder: Path, settings: Settings, kind: str, twin: int | None, seed: int) -> None:
