@@ -23,7 +23,7 @@ BENCHMARKS = {
     "calibration": "benchmarks.accuracy.calibration:measure",
     "arms": "benchmarks.accuracy.arms:measure",
     "printed": "benchmarks.accuracy.printed:measure",
-    "paper": "benchmarks.paper.experiments:Paper",
+    "paper": "benchmarks.paper.experiments:paper",
 }
 
 

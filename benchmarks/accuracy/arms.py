@@ -9,19 +9,16 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 from benchmarks.harness.common import names_of, target
 from benchmarks.harness.peers import peer_python
-from benchmarks.harness.stages import WorkStage, claim, command, run_stages
+from benchmarks.harness.stages import EVALUATION_FILE, WorkStage, claim, command, run_stages, train
 from mjx_softarm._support import cli
 from mjx_softarm._support.fields import scaled
-from mjx_softarm._support.provenance import write_json
 from mjx_softarm.spec import ArmSpec
 
-N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
 
 # Turns [deg] of the base. An arm that stands must do so without pressure, before it is calibrated: the arm of
@@ -30,9 +27,7 @@ HANGS, STANDS = (0.0, 0.0, 0.0), (180.0, 0.0, 0.0)
 FIGURES = {
     "goals": "points",
     "measured": "measured",
-    "reached": "reached",
     "mean [mm]": "translation_mm",
-    "95 % [mm]": "translation_95_mm",
     "largest [mm]": "max_mm",
     "mean [deg]": "rotation_deg",
     "saturated": "saturated_points",
@@ -45,17 +40,8 @@ class Kind(NamedTuple):
     name: str  # as for `--spec`
     turn_deg: tuple[float, float, float] = HANGS  # of its base
     mass_share: float = 1.0
-    driver: str = ""  # "": a rod twin
+    driver: str = ""  # for `--arm`; "": a rod twin
     peer: str = ""  # library of `benchmarks.harness.peers` in whose environment the driver runs
-
-    def arm(self, file: Path) -> str:
-        """Return the stand-in's name for `--arm`; a rod twin has the specification of `file`."""
-        return self.driver or f"twin:rod:0@{file}"
-
-    @property
-    def python(self) -> Path | str:
-        """Interpreter for commands with the stand-in."""
-        return peer_python(self.peer) if self.peer else sys.executable
 
 
 ARMS = {
@@ -68,8 +54,7 @@ ARMS = {
 }
 
 
-@dataclass(frozen=True)
-class ArmSettings:
+class ArmSettings(NamedTuple):
     """Size of the measurement."""
 
     poses: int
@@ -77,6 +62,12 @@ class ArmSettings:
     steps: int | None
     points: int
     loads: tuple[int, ...]
+
+    @property
+    def goals(self) -> dict[str, tuple[str, int]]:
+        """Goals and payload [g] of each measurement, by its title."""
+        loaded = {f"circle, {load_g} g": ("circle", load_g) for load_g in self.loads}
+        return {"circle": ("circle", 0), "grid": ("grid", 0), **loaded}
 
 
 def measure(
@@ -100,14 +91,65 @@ def measure(
         keep: working folder: the same command continues, and arms may be added
 
     Raises:
-        InputError: a command failed, or the folder has other settings.
-        PeerError: SoRoMoX could not be installed.
+        InputError: a command failed, the folder has other settings, or SoRoMoX could not be installed.
     """
     settings, out = ArmSettings(poses, preset, steps, points, loads), keep.absolute()
-    claim(out, settings)
-    run_stages(out, settings, [[WorkStage(arm, (f"{arm}/figures.json",), take, (arm,)) for arm in arms]])
-    figures = {arm: json.loads((out / arm / "figures.json").read_text("utf-8")) for arm in arms}
+    claim(out, settings._asdict())
+    made = {arm: tuple(str(accuracy_file(Path(arm), title)) for title in settings.goals) for arm in arms}
+    run_stages(out, settings, [[WorkStage(arm, made[arm], take, (arm,)) for arm in arms]])
+    figures = {arm: figures_of(out / arm, settings) for arm in arms}
     return {"targets": [_target(arm, row) for arm, row in figures.items()], **figures}
+
+
+def take(out: Path, settings: ArmSettings, arm: str) -> None:
+    """Take an arm through all commands, leaving out those whose results are there."""
+    # The arm, and its stand-in
+    kind, folder = ARMS[arm], out / arm
+    file, calibration, run = folder / "arm.toml", folder / "calibration", folder / "run"
+    spec = ArmSpec.of(Path(kind.name))
+    masses = {part: scaled(getattr(spec.mass, part), kind.mass_share) for part in ("arm_kg", "gripper_kg")}
+    folder.mkdir(parents=True, exist_ok=True)
+    spec.replace(mass=masses, mounting={"base_turn_deg": kind.turn_deg}).to_toml(file)
+    stand_in = "--arm", kind.driver or f"twin:rod:0@{file}"
+    python = peer_python(kind.peer) if kind.peer else sys.executable
+
+    def ensure(made: Path, *words: Any, python: Path | str = sys.executable) -> None:
+        """Run a command unless what it makes exists."""
+        if not made.exists():
+            command(folder / "commands.log", *words, makes=made, python=python)
+
+    # Record, calibrate, train and export
+    log = folder / "poses.npz"
+    record = ("mjx_softarm.deploy", "record", *stand_in, "--spec", file, "--poses", settings.poses)
+    ensure(log, *record, "--out", log, python=python)
+    ensure(calibration / "report.json", "calib", "run", log, "--spec", file, "--out", calibration)
+    steps = ("--learner.total-env-steps", settings.steps) if settings.steps else ()
+    if not (run / EVALUATION_FILE).exists():
+        train(run, "reach", "--preset", settings.preset, "--calibration", calibration, *steps)
+    ensure(run / "policy.npz", "train", "export", run)
+
+    # Measure the policy on its arm
+    asked = ("mjx_softarm.deploy", "measure", run / "policy.npz", *stand_in, "--points", settings.points)
+    for title, (goals, load_g) in settings.goals.items():
+        made = accuracy_file(folder, title)
+        options = ("--goals", goals, *(("--payload", load_g) if load_g else ()), "--out", made.parent)
+        ensure(made, *asked, *options, python=python)
+
+
+def accuracy_file(folder: Path, title: str) -> Path:
+    """Return the file of a measurement in the folder of an arm."""
+    return folder / title.replace(", ", "-").replace(" ", "") / "accuracy.json"
+
+
+def figures_of(folder: Path, settings: ArmSettings) -> dict[str, Any]:
+    """Return the figures of an arm's measurements."""
+    figures = {"length [mm]": 1e3 * ArmSpec.from_toml(folder / "arm.toml").length_m}
+    for title, (_, load_g) in settings.goals.items():
+        accuracy = json.loads(accuracy_file(folder, title).read_text("utf-8"))
+        figures |= {f"{title}, {name}": accuracy[key] for name, key in FIGURES.items()}
+        if load_g:
+            figures[f"{title}, estimated [g]"] = accuracy["load_estimate_g"]
+    return figures
 
 
 def _target(arm: str, row: dict[str, Any]) -> dict[str, str]:
@@ -119,62 +161,3 @@ def _target(arm: str, row: dict[str, Any]) -> dict[str, str]:
         f"{share:.2%} in the mean, {n_refused} of {row['circle, goals']} goals refused",
         share <= WITHIN and not n_refused,
     )
-
-
-def take(out: Path, settings: ArmSettings, arm: str) -> None:
-    """Take an arm through all commands, leaving out those whose results are there; write its figures."""
-    # The arm, and its stand-in
-    folder, kind = out / arm, ARMS[arm]
-    folder.mkdir(parents=True, exist_ok=True)
-    file, calibration, run = folder / "arm.toml", folder / "calibration", folder / "run"
-    spec = ArmSpec.of(Path(kind.name))
-    masses = {part: scaled(getattr(spec.mass, part), kind.mass_share) for part in ("arm_kg", "gripper_kg")}
-    spec = spec.replace(mass=masses, mounting={"base_turn_deg": kind.turn_deg})
-    spec.to_toml(file)
-    stand_in = "--arm", kind.arm(file)
-    logs = {folder / "poses.npz": (settings.poses,), folder / "moving.npz": (N_MOVING, "--transients")}
-
-    def ensure(made: Path, *words: Any, on_arm: bool = False) -> None:
-        """Run a command unless what it makes exists."""
-        if not made.exists():
-            python = kind.python if on_arm else sys.executable
-            command(folder / "commands.log", *words, makes=made, python=python)
-
-    # Record, calibrate, train and export
-    record = ("mjx_softarm.deploy", "record", *stand_in, "--spec", file)
-    for log, options in logs.items():
-        ensure(log, *record, "--poses", *options, "--out", log, on_arm=True)
-    ensure(calibration / "report.json", "calib", "run", *logs, "--spec", file, "--out", calibration)
-    steps = ("--learner.total-env-steps", settings.steps) if settings.steps else ()
-    begin = ("--preset", settings.preset, "--calibration", calibration, *steps, "--out", run)
-    resumed = (run / "config.json").exists()
-    ensure(run / "evaluation.json", "train", "reach", *(("--resume", run) if resumed else begin))
-    policy = run / "policy.npz"
-    ensure(policy, "train", "export", run)
-
-    # Measure the policy on its arm
-    figures = {"length [mm]": 1e3 * spec.length_m, **_calibration_figures(calibration)}
-    measured = {"circle": ("circle", 0), "grid": ("grid", 0)}
-    measured |= {f"circle, {load_g} g": ("circle", load_g) for load_g in settings.loads}
-    for title, (goals, load_g) in measured.items():
-        new = folder / title.replace(", ", "-").replace(" ", "")
-        options = ("--goals", goals, "--points", settings.points, *(("--payload", load_g) if load_g else ()))
-        asked = ("mjx_softarm.deploy", "measure", policy, *stand_in, *options, "--out", new)
-        ensure(new / "accuracy.json", *asked, on_arm=True)
-        accuracy = json.loads((new / "accuracy.json").read_text("utf-8"))
-        figures |= {f"{title}, {what}": accuracy[key] for what, key in FIGURES.items()}
-        if load_g:
-            figures[f"{title}, estimated [g]"] = accuracy["load_estimate_g"]
-    write_json(folder / "figures.json", figures)
-
-
-def _calibration_figures(calibration: Path) -> dict[str, Any]:
-    """Return figures of a calibration's report."""
-    report = json.loads((calibration / "report.json").read_text("utf-8"))
-    chambers, network = (report["parts"][title]["figures"] for title in ("Chambers", "Sim-to-real network"))
-    return {
-        "calibration without warnings": report["trustworthy"],
-        "unknown directions": len(chambers["weak"]),
-        "tip without S2R, held out [mm]": network["test_uncorrected"]["translation_mean_mm"],
-        "tip with S2R, held out [mm]": network["test"]["translation_mean_mm"],
-    }

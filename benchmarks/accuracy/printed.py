@@ -7,14 +7,13 @@ postures in this simulation. A run whose results exist is not repeated: seeds an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness.common import names_of
-from benchmarks.harness.stages import WorkStage, claim, command, run_stages
+from benchmarks.harness.common import names_of, over_runs
+from benchmarks.harness.stages import EVALUATION_FILE, WorkStage, claim, run_stages, train
 from mjx_softarm._support import cli, xla
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics.pipe import PIPES
@@ -25,8 +24,7 @@ from train.demos.waypoints import task as waypoints_of
 from train.runs.folder import Run
 
 PRESETS = {"circle16": "paper-circle", "pipe300": "paper-pipe"}
-LOSSES = {"tqc/critic_loss": "critics' loss", "tqc/actor_loss": "actor's loss"}
-LOSSES |= {"gail/discriminator_loss": "discriminator's loss"}
+FIGURES = ("success_share", "reached_share", "median_mm", "saturated_positions")  # of the last evaluation
 
 
 class Case(NamedTuple):
@@ -62,13 +60,6 @@ CASES = {
 }
 
 
-@dataclass(frozen=True)
-class PrintedSettings:
-    """Further settings of the runs."""
-
-    env_steps: int | None = None  # of each run; None: the preset's
-
-
 def measure(
     out: Path = Path("runs/printed"),
     seeds: cli.Integers = (0, 1, 2),
@@ -87,24 +78,18 @@ def measure(
         InputError: a training failed, or the folder has other settings.
     """
     # Demonstrate, and train what is not trained yet.
-    settings = PrintedSettings(env_steps)
-    claim(out, settings)
+    claim(out, {"env_steps": env_steps})
     runs = {name: seeds[:1] if CASES[name].one_seed else seeds for name in cases}
     tasks = dict.fromkeys(CASES[name].task for name in cases)
     demonstrated = [WorkStage(f"demonstrate {t}", (demos_file(t),), demonstrate, (t,)) for t in tasks]
     trained = [
-        WorkStage(f"{name}, seed {seed}", (f"{run_name(name, seed)}/evaluation.json",), train, (name, seed))
-        for name, own in runs.items()
-        for seed in own
+        WorkStage(f"{name}, seed {n}", (f"{run_name(name, n)}/{EVALUATION_FILE}",), imitate, (name, n))
+        for name in cases
+        for n in runs[name]
     ]
-    run_stages(out, settings, [demonstrated, trained])
-    metrics = {name: [Run.open(out / run_name(name, n)).metrics() for n in own] for name, own in runs.items()}
-    penalised = [name for name in runs if name.startswith("circle-learned")]
-    return {
-        "cases": [over_seeds(name, metrics[name]) for name in runs],
-        "losses": [row for name in penalised for row in loss_rows(name, metrics[name][0])],
-        "curves": curves(metrics),
-    }
+    run_stages(out, env_steps, [demonstrated, trained])
+    metrics = {name: [Run.open(out / run_name(name, n)).metrics() for n in runs[name]] for name in cases}
+    return {"cases": final_figures(metrics), "curves": curves(metrics)}
 
 
 def demos_file(task: str) -> str:
@@ -117,7 +102,7 @@ def run_name(case: str, seed: int) -> str:
     return f"{case}-seed{seed}"
 
 
-def demonstrate(folder: Path, settings: PrintedSettings, task: str) -> None:
+def demonstrate(folder: Path, _: int | None, task: str) -> None:
     """Write the demonstrations of a task, the expert's postures as the training model has them."""
     xla.enable_compilation_cache()
     file, spec = folder / demos_file(task), ArmSpec.default()
@@ -140,67 +125,37 @@ def demonstrate(folder: Path, settings: PrintedSettings, task: str) -> None:
     )
 
 
-def train(folder: Path, settings: PrintedSettings, name: str, seed: int) -> None:
-    """Train a policy of a case, or resume an interrupted run."""
-    run, case = folder / run_name(name, seed), CASES[name]
-    log, made = run.with_suffix(".log"), run / "evaluation.json"
-    if (run / "config.json").exists():
-        command(log, "train", "imitate", "--resume", run, makes=made)
-        return
-    options = ["--preset", PRESETS[case.task], "--seed", seed, "--out", run]
+def imitate(folder: Path, env_steps: int | None, name: str, seed: int) -> None:
+    """Train a policy of a case."""
+    case = CASES[name]
+    options = ["--preset", PRESETS[case.task], "--seed", seed]
     if pipe := PIPES.get(case.task):
         options += ["--pipe", f"{1e3 * pipe.diameter_m:g}"]
-    if settings.env_steps:
-        options += ["--learner.total-env-steps", settings.env_steps]
-    changes = [f"--{text.removesuffix('=true')}" for text in case.settings]  # a flag has no value
-    command(log, "train", "imitate", folder / demos_file(case.task), *options, *changes, makes=made)
+    if env_steps:
+        options += ["--learner.total-env-steps", env_steps]
+    options += [f"--{text.removesuffix('=true')}" for text in case.settings]  # a flag has no value
+    train(folder / run_name(name, seed), "imitate", folder / demos_file(case.task), *options)
 
 
-FIGURES = (
-    *("success_share", "reached_share", "median_mm", "max_mm", "x_mm", "y_mm", "z_mm"),
-    *("saturated_positions", "outside_positions"),
-)
+Metrics = Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]  # rows of each seed of each case
 
 
-def over_seeds(name: str, metrics: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """Return the final figures of a case: mean over its seeds, and least and greatest."""
-    last = [{key.removeprefix("evaluation/"): x for key, x in rows[-1].items()} for rows in metrics]
-    counts = {key: last[0][key] for key in ("env_steps", "updates")}
-    spread = {key: _spread([row[key] for row in last]) for key in FIGURES if key in last[0]}
-    return {"case": name, "seeds": len(last), **counts, **spread}
+def final_figures(metrics: Metrics) -> list[dict[str, Any]]:
+    """Return the final figures of each case: the spread over its seeds."""
+    last = [
+        {"case": name, **{key.removeprefix("evaluation/"): x for key, x in rows[-1].items()}}
+        for name, runs in metrics.items()
+        for rows in runs
+    ]
+    return over_runs(last, ("case", "env_steps", "updates"), FIGURES)
 
 
-def _spread(values: Sequence[float]) -> str:
-    mean, low, high = (f"{x:.4g}" for x in (np.mean(values), min(values), max(values)))
-    return mean if low == high else f"{mean} ({low} to {high})"
-
-
-def curves(metrics: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> dict[str, dict[str, Any]]:
+def curves(metrics: Metrics) -> list[dict[str, Any]]:
     """Return the success [%] of each seed at the evaluations of each case."""
-    found = {}
+    rows = []
     for name, runs in metrics.items():
-        rows = [[row for row in run if "evaluation/success_share" in row] for run in runs]
-        percent = [[round(100 * row["evaluation/success_share"], 1) for row in run] for run in rows]
-        found[name] = {"env_steps": [row["env_steps"] for row in rows[0]], "success_percent": percent}
-    return found
-
-
-def loss_rows(name: str, rows: Sequence[Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Return how each loss of a run begins, ends and fluctuates.
-
-    The fluctuation is the median change from epoch to epoch, in the second half of the run.
-    """
-    found = []
-    for key, title in LOSSES.items():
-        values = np.array([row[key] for row in rows if row["updates"]])
-        tenth, half = max(1, len(values) // 10), len(values) // 2
-        found.append(
-            {
-                "case": name,
-                "loss": title,
-                "first tenth": float(values[:tenth].mean()),
-                "last tenth": float(values[-tenth:].mean()),
-                "fluctuation": float(np.median(np.abs(np.diff(values[half:])))),
-            }
-        )
-    return found
+        evaluated = [[row for row in run if "evaluation/success_share" in row] for run in runs]
+        percent = [[round(100 * row["evaluation/success_share"], 1) for row in run] for run in evaluated]
+        env_steps = [row["env_steps"] for row in evaluated[0]]
+        rows.append({"case": name, "env_steps": env_steps, "success_percent": percent})
+    return rows

@@ -1,7 +1,6 @@
-"""Shared parts of the benchmarks: the machine, targets, tables, and where results go.
+"""Shared parts of the benchmarks: the machine, targets, spreads over runs, tables, and where results go.
 
-Figures are nested dictionaries of plain values, made for JSON. `show` prints any of them: a list of flat
-dictionaries becomes a table with their keys as its head, other values become a table of names and values.
+Figures are nested dictionaries of plain values, made for JSON. `show` prints any of them.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from jax.sharding import Mesh
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -23,11 +22,12 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import provenance, write_json
-from train.epoch.devices import mesh_of
 
 RESULTS = Path(__file__).parents[2] / "docs/results"
 WIDTH = 160  # of tables, where they are not printed to a terminal
 VERDICT = {True: "met", False: "NOT MET", None: "skipped"}
+
+Row = Mapping[str, Any]
 
 
 def n_cores() -> int:
@@ -47,26 +47,8 @@ def machine_kind() -> str:
     return jax.devices()[0].device_kind if jax.default_backend() == "gpu" else cpu_kind()
 
 
-def mesh_of_cores(n_arms: int) -> Mesh | None:
-    """Make devices of this process's cores, as many as n arms spread over evenly; call it before JAX is used.
-
-    XLA runs most of settling on one core, so a CPU that is one device leaves the others idle.
-
-    Returns:
-        None for a single device: on a GPU, or where the arms cannot be spread evenly.
-    """
-    jax.config.update("jax_num_cpu_devices", n_cores())
-    n = max(n for n in range(1, n_cores() + 1) if n_arms % n == 0)
-    return mesh_of(str(n)) if jax.default_backend() == "cpu" else None
-
-
-def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
-    """Return a row for a target; if `met` is None it could not be measured, and `measured` says why."""
-    return {"target": text, "measured": measured, "verdict": VERDICT[met]}
-
-
 def names_of(known: Iterable[str]) -> PrimitiveConstructorSpec:
-    """Return how an option is read whose value is some known names with commas between them."""
+    """Return the reader of an option whose value is some known names with commas between them."""
     known = tuple(known)
 
     def read(words: list[str]) -> tuple[str, ...]:
@@ -78,62 +60,57 @@ def names_of(known: Iterable[str]) -> PrimitiveConstructorSpec:
     return cli.listed(read, "NAME,NAME,...")
 
 
-def grouped(
-    rows: Iterable[Mapping[str, Any]], keys: Sequence[str]
-) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
+    """Return a row for a target; if `met` is None it could not be measured, and `measured` says why."""
+    return {"target": text, "measured": measured, "verdict": VERDICT[met]}
+
+
+def status_of(figures: Row) -> int:
+    """Return the exit status: 1 where a target is missed, else 0."""
+    return int(any(row["verdict"] == VERDICT[False] for row in figures.get("targets", ())))
+
+
+def grouped(rows: Iterable[Row], keys: Sequence[str]) -> dict[tuple[Any, ...], list[Row]]:
     """Return rows by their values of some keys, in the order of the first row of each group."""
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[key] for key in keys), []).append(row)
     return groups
 
 
-def status_of(figures: Mapping[str, Any]) -> int:
-    """Return the exit status: 1 where a target is missed, else 0."""
-    return int(any(row["verdict"] == VERDICT[False] for row in figures.get("targets", ())))
+def over_runs(rows: Iterable[Row], keys: Sequence[str], figures: Sequence[str]) -> list[dict[str, Any]]:
+    """Return a row for each group of runs with the same values of `keys`: the spread of each figure."""
+    return [
+        dict(zip(keys, values, strict=True))
+        | {"runs": len(runs)}
+        | {name: spread([run[name] for run in runs]) for name in figures if name in runs[0]}
+        for values, runs in grouped(rows, keys).items()
+    ]
 
 
-def show(figures: Mapping[str, Any], title: str = "", console: Console | None = None) -> None:
-    """Print figures as tables."""
-    console = console or Console(width=None if sys.stdout.isatty() else WIDTH)
-    loose = {name: value for name, value in figures.items() if not _parts(value)}
-    if loose:
-        rows = [{"figure": name.replace("_", " "), "value": value} for name, value in loose.items()]
-        _print_table(console, title, rows)
+def spread(values: Sequence[float]) -> str:
+    """Return "mean ± standard deviation (least to greatest)", or the value if all are the same."""
+    x = np.asarray(values, float)
+    mean, off, low, high = x.mean(), x.std(), x.min(), x.max()
+    return f"{mean:.4g}" if low == high else f"{mean:.4g} ± {off:.2g} ({low:.4g} to {high:.4g})"
+
+
+def show(figures: Row, title: str = "", console: Console | None = None) -> None:
+    """Print figures: a line for each value, a table for each list of rows."""
+    console = console or Console(width=None if sys.stdout.isatty() else WIDTH, highlight=False)
     for name, value in figures.items():
-        if name in loose:
-            continue
         path = ", ".join(filter(None, [title, name.replace("_", " ")]))
-        if rows := _rows(value):
-            _print_table(console, path, rows)
+        if isinstance(value, Mapping):
+            show(value, path, console)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            _print_table(console, path, value)
         else:
-            show(_parts(value), path, console)
+            console.print(Text(f"{path}: {_cell(value)}"))
 
 
-def _rows(value: Any) -> list[dict[str, Any]]:
-    """Return rows of a table: flat dictionaries in a list or, if their keys agree, by name; else none."""
-    parts = _parts(value)
-    rows = list(parts.values())
-    if not all(isinstance(row, Mapping) and not any(map(_parts, row.values())) for row in rows):
-        return []
-    if not isinstance(value, Mapping):
-        return rows
-    alike = len({tuple(row) for row in rows}) == 1
-    return [{"": name.replace("_", " "), **row} for name, row in parts.items()] if alike else []
-
-
-def _parts(value: Any) -> dict[str, Any]:
-    """Return the items of a dictionary or of a list of dictionaries by name; none for other values."""
-    if isinstance(value, Mapping):
-        return dict(value)
-    if isinstance(value, list | tuple) and all(isinstance(part, Mapping) for part in value):
-        return {str(k): part for k, part in enumerate(value, 1)}
-    return {}
-
-
-def _print_table(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    names = list(dict.fromkeys(name for row in rows for name in row))
+def _print_table(console: Console, title: str, rows: Sequence[Row]) -> None:
     table = Table()
+    names = list(dict.fromkeys(name for row in rows for name in row))
     for name in names:
         side = "right" if all(isinstance(row.get(name), int | float | None) for row in rows) else "left"
         table.add_column(Text(name.replace("_", " ")), justify=side, overflow="fold")
@@ -152,7 +129,7 @@ def _cell(value: Any) -> str:
     return "" if value is None else str(value)
 
 
-def save(name: str, figures: dict[str, Any], folder: Path | None = None) -> Path:
+def save(name: str, figures: Row, folder: Path | None = None) -> Path:
     """Write figures with machine, versions, command and commit to NAME.json in `docs/results` or a folder."""
     path = (folder or RESULTS) / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,9 @@ import venv
 from importlib import metadata
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from benchmarks.harness.rounds import ROOT
+from mjx_softarm._support.errors import InputError
+
 MARKER = "complete"
 
 _SB3 = ("stable-baselines3==2.9.2", "torch==2.13.0")
@@ -33,15 +35,11 @@ SHARED = (
 )
 
 
-class PeerError(RuntimeError):
-    """A peer that cannot be installed; the message says which, and why."""
-
-
 def peer_python(name: str, root: Path = ROOT) -> Path:
     """Return the interpreter of the virtual environment of a peer, a key of `PINS`; make it if it is missing.
 
     Raises:
-        PeerError: it could not be made.
+        InputError: it could not be made.
     """
     home, packages = root / f".venv-{name}", peer_packages(name)
     python, marker = home / "bin" / "python", home / MARKER
@@ -52,11 +50,13 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
     print(f"making {home} with {packages[0]}{large}; the first time this takes minutes ...", flush=True)
     marker.unlink(missing_ok=True)
     try:
-        _make(home, python, packages)
+        venv.create(home, with_pip=True, clear=True)
+        install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *packages]
+        subprocess.run(install, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        got = said[-1] if said else error
-        raise PeerError(f"{name}: got {got}, expected a virtual environment in {home}") from error
+        output = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        expected = f"expected a virtual environment in {home}"
+        raise InputError(f"{name}: got {output[-1] if output else error}, {expected}") from error
     marker.write_text(content, "utf-8")
     return python
 
@@ -68,9 +68,3 @@ def peer_packages(name: str) -> tuple[str, ...]:
     if "jax-cuda12-plugin" in {distribution.name for distribution in metadata.distributions()}:
         versions["jax[cuda12]"] = versions.pop("jax")
     return tuple(f"{package}=={version}" for package, version in versions.items())
-
-
-def _make(home: Path, python: Path, packages: tuple[str, ...]) -> None:
-    venv.create(home, with_pip=True, clear=True)
-    install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *packages]
-    subprocess.run(install, check=True, capture_output=True, text=True)

@@ -7,10 +7,10 @@ whole or not at all, so a stage that was killed is simply not done.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,51 +20,43 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from mjx_softarm._support.errors import InputError
-from mjx_softarm._support.files import replacing
 from mjx_softarm._support.provenance import write_json
 
-SETTINGS_FILE = "settings.json"
+EVALUATION_FILE = "evaluation.json"  # of a run, written once its training is done
 N_WORKERS = 2  # each on its share of the cores: faster than one training on all of them
 DONE = (0, 1)  # exit statuses of a command that wrote its results; 1: they miss a bound
 
 
 class WorkStage(NamedTuple):
-    """A job, called with the folder, the settings and its inputs; it is done once its results exist."""
+    """A function of the folder, the settings and some inputs; it is done once its results exist."""
 
     name: str
     results: tuple[str, ...]  # paths in the folder
     function: Callable[..., None]
     inputs: tuple[Any, ...] = ()
 
+    def missing(self, folder: Path) -> list[str]:
+        """Return the results that do not exist."""
+        return [path for path in self.results if not (folder / path).exists()]
 
-def claim(folder: Path, settings: Any, more: Sequence[str] = ()) -> None:
+
+def claim(folder: Path, settings: dict[str, Any]) -> None:
     """Make the folder, or check that its results have these settings.
-
-    Args:
-        folder: working folder.
-        settings: a dataclass.
-        more: fields that may differ, since they add results to the others.
 
     Raises:
         InputError: the folder has other settings.
     """
-    file, given = folder / SETTINGS_FILE, json.loads(json.dumps(dataclasses.asdict(settings)))
-    shared = {name: value for name, value in given.items() if name not in more}
+    file = folder / "settings.json"
+    expected = json.loads(json.dumps(settings))
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(file, shared)
-    if differing := difference(json.loads(file.read_text("utf-8")), shared):
-        raise InputError(f"{file}: {differing}; choose another folder")
-
-
-def difference(stored: dict[str, Any], expected: dict[str, Any]) -> str:
-    """Return "got ..., expected ..." of the settings that differ, or "" if none does."""
+        write_json(file, expected)
+    stored = json.loads(file.read_text("utf-8"))
     names = [name for name in expected if stored.get(name) != expected[name]]
-    got, asked = (", ".join(f"{name} {values.get(name)}" for name in names) for values in (stored, expected))
-    return f"got {got}, expected {asked}" if names else ""
+    if names:
+        got, asked = (", ".join(f"{name} {made.get(name)}" for name in names) for made in (stored, expected))
+        raise InputError(f"{file}: got {got}, expected {asked}; choose another folder")
 
 
 def run_stages(folder: Path, settings: Any, groups: Sequence[Sequence[WorkStage]]) -> None:
@@ -73,49 +65,31 @@ def run_stages(folder: Path, settings: Any, groups: Sequence[Sequence[WorkStage]
     Raises:
         InputError: a stage failed, or left no results; those under way are finished, the others not begun.
     """
-    for group in groups:
-        pending = [stage for stage in group if missing(folder, stage)]
-        if pending:
-            _in_parallel(folder, settings, pending)
-
-
-def missing(folder: Path, stage: WorkStage) -> list[str]:
-    """Return the results of a stage that do not exist."""
-    return [path for path in stage.results if not (folder / path).exists()]
-
-
-def _in_parallel(folder: Path, settings: Any, stages: Sequence[WorkStage]) -> None:
-    """Run stages in processes of their own, `N_WORKERS` at a time."""
-    # Workers, each with a share of the cores
     context = multiprocessing.get_context("spawn")
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    n_workers = min(N_WORKERS, len(cores) or 1)
-    shares = context.Queue()
-    for k in range(n_workers):
-        shares.put(cores[k::n_workers])
-    # All stages, in the order of the list; the first that fails ends them
-    pool = ProcessPoolExecutor(n_workers, context, _prepare_worker, (shares,))
-    try:
-        waiting = {pool.submit(stage.function, folder, settings, *stage.inputs): stage for stage in stages}
-        for n_done, future in enumerate(as_completed(waiting), 1):
-            stage = waiting[future]
-            try:
-                future.result()
-                if absent := missing(folder, stage):
-                    raise InputError(f"got no {', '.join(absent)} in {folder}, expected its results")
-            except Exception as error:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise InputError(f"{stage.name}: {type(error).__name__}: {error}") from error
-            print(f"{n_done} of {len(stages)}: {stage.name}", flush=True)
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+    for group in groups:
+        pending = [stage for stage in group if stage.missing(folder)]
+        shares = context.Queue()
+        for k in range(N_WORKERS):
+            shares.put(cores[k::N_WORKERS] or cores)
+        with ProcessPoolExecutor(N_WORKERS, context, _prepare_worker, (shares,)) as pool:
+            stages = {
+                pool.submit(stage.function, folder, settings, *stage.inputs): stage for stage in pending
+            }
+            for n_done, future in enumerate(as_completed(stages), 1):
+                stage = stages[future]
+                try:
+                    future.result()
+                    if missing := stage.missing(folder):
+                        raise InputError(f"got no {', '.join(missing)} in {folder}, expected its results")
+                except Exception as error:
+                    pool.shutdown(cancel_futures=True)
+                    raise InputError(f"{stage.name}: {type(error).__name__}: {error}") from error
+                print(f"{n_done} of {len(pending)}: {stage.name}", flush=True)
 
 
 def _prepare_worker(shares: Any) -> None:
-    """Keep a worker and its children to its cores; Ctrl-C ends it, as training saves by itself.
-
-    The end of the benchmark, however it comes, ends it too.
-    """
+    """Keep a worker and its children to its cores. It ends with Ctrl-C, and when the benchmark ends."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if share := shares.get():
@@ -150,21 +124,14 @@ def command(log: Path, *words: Any, makes: Path, python: Path | str = sys.execut
         raise InputError(f"{asked}, expected one of {DONE} and {makes}; {log} ends with\n{last}")
 
 
-def save_arrays(path: Path, arrays: Any) -> None:
-    """Write a named tuple of arrays whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **arrays._asdict())
+def train(run: Path, task: str, *words: Any) -> None:
+    """Train with `python -m train TASK` into the folder `run`, or resume a training that was interrupted.
 
-
-def load_arrays(kind: Any, path: Path) -> Any:
-    """Read the named tuple, of the class `kind`, that `save_arrays` wrote.
-
-    Raises:
-        InputError: it lacks an array.
+    A run without a checkpoint, or without a config, which is written last, starts anew.
     """
-    with np.load(path) as file:
-        if absent := [name for name in kind._fields if name not in file]:
-            why = f"got no {', '.join(absent)}, expected the arrays of this version"
-            raise InputError(f"{path}: {why}; remove the file, or choose another folder")
-        return kind(**{name: file[name] for name in kind._fields})
+    saved = any(path.name.isdecimal() for path in (run / "checkpoints").glob("*"))
+    begun = saved and (run / "config.json").exists()
+    if not begun:
+        shutil.rmtree(run, ignore_errors=True)
+    options = ("--resume", run) if begun else (*words, "--out", run)
+    command(run.with_suffix(".log"), "train", task, *options, makes=run / EVALUATION_FILE)

@@ -1,4 +1,4 @@
-"""Gradient descent on the springs: the solver that the policy is compared with. NumPy only.
+"""Gradient descent on the springs: the solver that the policy is compared with.
 
 From the measured springs, lengths within the policy's range follow the negative gradient of the squared error
 of the estimated pose. A degree weighs as much as a millimetre: with the reward's weights, the search takes
@@ -14,8 +14,8 @@ Source: the solver of Meng et al. 2023 as the paper describes it where it states
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
+import jax
 import numpy as np
 
 from mjx_softarm.policy.file import Policy
@@ -51,7 +51,8 @@ def gradient_descent(policy: Policy) -> Callable[..., np.ndarray]:
 
 def forward_kinematics(policy: Policy) -> Callable[[np.ndarray], np.ndarray]:
     """Return the map of springs (..., n) [m] to poses (..., 6) [mm, deg] of the specified arm, in float64."""
-    estimator, s2r = _double(policy.estimator), _double(policy.s2r)
+    networks = policy.estimator, policy.s2r
+    estimator, s2r = jax.tree.map(lambda x: np.asarray(x, np.float64), networks)
 
     def pose_of(spring_m: np.ndarray) -> np.ndarray:
         pose = estimate(estimator, spring_m, policy.spec.mass.payload_kg)
@@ -90,11 +91,3 @@ def gradient(residual: Residual, spring_m: np.ndarray) -> np.ndarray:
 
 def _cost(residual: Residual, x: np.ndarray) -> float:
     return 0.5 * float(np.sum(residual(x) ** 2))
-
-
-def _double(network: Any) -> Any:
-    """Return a network, nested tuples of arrays, in float64; None stays None."""
-    if isinstance(network, tuple):
-        parts = [_double(part) for part in network]
-        return type(network)(*parts) if hasattr(network, "_fields") else tuple(parts)
-    return None if network is None else np.asarray(network, np.float64)

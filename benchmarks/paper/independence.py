@@ -13,8 +13,9 @@ pressures. It goes to some of the goals without a payload, with as many searches
 from __future__ import annotations
 
 import functools
+import itertools
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from benchmarks.harness.common import grouped
+from benchmarks.harness.common import over_runs
 from benchmarks.paper.gradient_descent import gradient_descent
 from benchmarks.paper.trials import Settings
 from mjx_softarm import ArmSpec
@@ -43,6 +44,7 @@ from train.runs.evaluate import Reached, paths_of, start_keys, towards
 from train.runs.task import task_of
 
 LOADS_G = (0, 250, 500, 1000)
+FIGURES = ("median_mm", "mean_mm", "p95_mm", "saturated_percent")
 SOLVER, N_SOLVED = "gradient descent", 50  # goals of each set, for each seed
 
 
@@ -83,66 +85,58 @@ POLICIES = {
 }
 
 
-def results_of(name: str, seeds: Iterable[int]) -> tuple[str, ...]:
-    """Return the files of a kind of policy, or of the solver, in the folder."""
-    words = name.replace(",", "").replace(" ", "-")
-    return tuple(f"independence/{words}-seed{seed}.json" for seed in seeds)
+def result(name: str, seed: int) -> str:
+    """Return the file of a policy, or of the solver, in the folder."""
+    return f"independence/{name.replace(',', '').replace(' ', '-')}-seed{seed}.json"
 
 
-def measure(folder: Path, settings: Settings, name: str) -> None:
-    """Train policies of a kind, or take the solver, and write the errors of each seed with each payload."""
+def measure(folder: Path, settings: Settings, name: str, seed: int) -> None:
+    """Train a policy, or take the solver, and write its errors with each payload."""
+    xla.enable_compilation_cache()
+    rows = descent_rows(settings, seed) if name == SOLVER else policy_rows(settings, name, seed)
     (folder / "independence").mkdir(exist_ok=True)
-    rows_of = descent(settings) if name == SOLVER else PolicyTrial(name, settings).rows
-    for seed, path in zip(settings.seeds, results_of(name, settings.seeds), strict=True):
-        if not (folder / path).exists():
-            write_json(folder / path, rows_of(seed))
+    write_json(folder / result(name, seed), rows)
 
 
 def figures_of(folder: Path, settings: Settings) -> dict[str, Any]:
-    """Return the figures of all seeds, and their means."""
+    """Return the figures of all seeds, and their spreads."""
     runs = [
         {"commands": name, "seed": seed, **row}
-        for name in (*POLICIES, SOLVER)
-        for seed, path in zip(settings.seeds, results_of(name, settings.seeds), strict=True)
-        for row in json.loads((folder / path).read_text("utf-8"))
+        for name, seed in itertools.product((*POLICIES, SOLVER), settings.seeds)
+        for row in json.loads((folder / result(name, seed)).read_text("utf-8"))
     ]
     return {
         "env_steps": settings.independence_steps,
         "goals": settings.n_goals,
-        "under loads": means(runs, ("commands", "load_g")),
-        "loads of all runs": runs,
+        "spreads": over_runs(runs, ("commands", "load_g"), FIGURES),
+        "runs": runs,
     }
 
 
-class PolicyTrial:
-    """Training and evaluation of one kind of policy, each compiled once."""
-
-    def __init__(self, name: str, settings: Settings):
-        xla.enable_compilation_cache()
-        steps = f"learner.total_env_steps={settings.independence_steps}"
-        kind, spec = POLICIES[name], ArmSpec.default()
-        self.config, self.n_goals = override(PRESETS["analytic"], [steps, *kind.settings]), settings.n_goals
-        seen, loaded = self.config.env.observation, Randomisation(payload_max_kg=LARGEST_KG)
-        env = kind.env(spec, EnvConfig(engine="chain", observation=seen, randomisation=loaded))
-        self.paths = paths_of(jnp.concatenate(goals_of(env, self.n_goals)))
-        self.keys = start_keys(len(self.paths))
-        self._job = task_of(self.config, kind.env(spec, self.config.env)).job
-        one = functools.partial(follow, env, epoch_of(self.config.learner, env).learner)
-        self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
-
-    def rows(self, seed: int) -> list[dict[str, Any]]:
-        """Train one policy; return its figures with each payload."""
-        state = self._job.start(lambda: self._job.init(jax.random.PRNGKey(seed)))
-        for _ in range(self.config.learner.n_epochs):
-            state, _ = self._job.epoch(state)
-        policy = jax.device_get(self._job.policy(state))
-        return [{"load_g": load_g, **self._figures(policy, load_g)} for load_g in LOADS_G]
-
-    def _figures(self, policy: Any, load_g: int) -> dict[str, float]:
-        """Return the figures at the goals of both sets."""
-        found = jax.device_get(self._follow(policy, 1e-3 * load_g, self.paths, self.keys))
-        at_goals = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: 2 * self.n_goals], found)
-        return figures(np.asarray(at_goals.tip_error_mm), np.asarray(at_goals.saturated_chambers))
+def policy_rows(settings: Settings, name: str, seed: int) -> list[dict[str, Any]]:
+    """Train one policy; return its figures at the goals of both sets with each payload."""
+    # Train.
+    kind, spec = POLICIES[name], ArmSpec.default()
+    steps = f"learner.total_env_steps={settings.independence_steps}"
+    config = override(PRESETS["analytic"], [steps, *kind.settings])
+    job = task_of(config, kind.env(spec, config.env)).job
+    state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
+    for _ in range(config.learner.n_epochs):
+        state, _ = job.epoch(state)
+    policy = jax.device_get(job.policy(state))
+    # Follow paths of goals.
+    loaded = Randomisation(payload_max_kg=LARGEST_KG)
+    env_config = EnvConfig(engine="chain", observation=config.env.observation, randomisation=loaded)
+    env = kind.env(spec, env_config)
+    paths = paths_of(jnp.concatenate(goals_of(env, settings.n_goals)))
+    one = functools.partial(follow, env, epoch_of(config.learner, env).learner)
+    follow_all = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
+    rows = []
+    for load_g in LOADS_G:
+        reached = jax.device_get(follow_all(policy, 1e-3 * load_g, paths, start_keys(len(paths))))
+        at_goals = (np.ravel(reached.tip_error_mm), np.ravel(reached.saturated_chambers))
+        rows.append({"load_g": load_g, **figures(*(x[: 2 * settings.n_goals] for x in at_goals))})
+    return rows
 
 
 def goals_of(env: ReachEnv, n_goals: int) -> list[Array]:
@@ -167,38 +161,20 @@ def figures(off_mm: np.ndarray, n_saturated: np.ndarray) -> dict[str, float]:
     }
 
 
-def descent(settings: Settings) -> Callable[[int], list[dict[str, Any]]]:
-    """Return a function, seed -> figures of gradient descent, which knows of no payload.
+def descent_rows(settings: Settings, seed: int) -> list[dict[str, Any]]:
+    """Return the figures of gradient descent, which knows of no payload.
 
     It goes to some goals of both sets, other ones for each seed, from a random pose, by the estimator of the
     policy that ships.
     """
     env, solve = ReachEnv(config=EnvConfig(engine="chain")), gradient_descent(load_policy(SHIPPED))
-    step, reset = xla.jit(env.step), xla.jit(env.reset)
-    sets = [np.asarray(poses) for poses in goals_of(env, settings.n_goals)]
-
-    def rows(seed: int) -> list[dict[str, Any]]:
-        rng, state = np.random.default_rng(seed), reset(jax.random.PRNGKey(seed))
-        ends = []
-        for goal in np.concatenate(
-            [rng.choice(poses, min(N_SOLVED, len(poses)), replace=False) for poses in sets]
-        ):
+    step, state = xla.jit(env.step), xla.jit(env.reset)(jax.random.PRNGKey(seed))
+    rng, ends = np.random.default_rng(seed), []
+    for poses in map(np.asarray, goals_of(env, settings.n_goals)):
+        for goal in rng.choice(poses, min(N_SOLVED, len(poses)), replace=False):
             for _ in range(N_ACTIONS):
                 arm = state.pipeline_state
                 spring_m = solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
                 state = step(towards(env, state, goal), env.action_of(jnp.asarray(spring_m)))
             ends.append([float(state.metrics[name]) for name in ("tip_error_mm", "saturated_chambers")])
-        return [{"load_g": 0, **figures(*np.array(ends).T)}]
-
-    return rows
-
-
-def means(rows: list[dict[str, Any]], by: tuple[str, ...]) -> list[dict[str, Any]]:
-    """Return the mean and the standard deviation over seeds of all figures, for each value of `by`."""
-    table = []
-    for key, group in grouped(rows, by).items():
-        names = [name for name in group[0] if name not in (*by, "seed")]
-        values = np.array([[row[name] for name in names] for row in group])
-        cells = (f"{mean:.2f} ± {off:.2f}" for mean, off in zip(values.mean(0), values.std(0), strict=True))
-        table.append(dict(zip(by, key, strict=True)) | dict(zip(names, cells, strict=True)))
-    return table
+    return [{"load_g": 0, **figures(*np.array(ends).T)}]

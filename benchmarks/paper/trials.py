@@ -1,14 +1,4 @@
-"""Parts that the paper's experiments compare: settings, ways to find references, and trials of them on twins.
-
-All stages share the folder of a benchmark, so that the same command goes on where it ended:
-
-    twinT/log.npz, twinT/calibration/      recorded and calibrated through `ArmIO` and logs alone
-    twinT/demos-TASK.npz                   demonstrations of the scripted expert on the twin
-    nominal-seedS/, twinT-seedS/           policies `analytic`; the nominal ones know no twin
-    KIND-twinT-seedS/                      policies of other kinds; see `KINDS`
-    trials/TRIAL.npz, trials/TRIAL-log.npz outcome of a trial on a twin, and the log of some
-    independence/KIND-seedS.json           errors with payloads, see `benchmarks.paper.independence`
-"""
+"""Parts that the paper's experiments compare: settings, ways to find references, trials, and their files."""
 
 from __future__ import annotations
 
@@ -16,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 EXPERIMENTS = ("open", "confined", "independence")
-CALIBRATION, EVALUATION_FILE, POLICY_FILE = "calibration", "evaluation.json", "policy.npz"
+CALIBRATION, POLICY_FILE = "calibration", "policy.npz"
 MORE = ("twins", "seeds", "loads_g", "beside")  # settings that results in a folder may differ in
 IN_TIME_S = (10.0, 20.0, 40.0)  # durations of one lap of the circle without a stop
 N_IN_TIME = 80  # points of this circle
@@ -40,6 +30,11 @@ class Settings:
     independence_steps: int = 262_144  # environment steps of each training of `independence`
     n_goals: int = 2000  # held-out goals of each of its two sets
 
+    @property
+    def runs(self) -> list[tuple[int, int]]:
+        """All pairs of a twin and a training seed."""
+        return [(twin, seed) for twin in self.twins for seed in self.seeds]
+
 
 SMOKE = Settings(
     twins=(0,),
@@ -62,7 +57,7 @@ class Kind(NamedTuple):
     """A way to find references: a solver, a policy, or a policy learned from demonstrations."""
 
     title: str
-    preset: str = ""  # of `python -m train reach`, or of `imitate` where there is a task
+    preset: str = "analytic"  # of `python -m train reach`, or of `imitate` where there is a task
     task: str = ""  # key of `mjx_softarm.mechanics.pipe.PIPES`, whose demonstrations it learns from
     settings: tuple[str, ...] = ()  # NAME=VALUE
     reward_of: str = ""  # kind whose learned reward it takes, unchanged
@@ -86,7 +81,7 @@ KINDS = {
     # Open space
     "specified": Kind("specification alone"),
     "without": Kind("calibrated springs"),
-    "chambers": Kind("calibrated springs and chambers", "analytic", settings=WITHOUT_S2R),
+    "chambers": Kind("calibrated springs and chambers", settings=WITHOUT_S2R),
     "with": Kind("with S2R"),
     "gradient": Kind("gradient descent"),
     "payload": Kind("with S2R, payload", "payload"),
@@ -103,8 +98,6 @@ KINDS = {
 }
 BESIDE = ("payload", "quick", "motion")
 PIPE_KINDS = tuple(name for name, kind in KINDS.items() if kind.task)
-
-PolicyKey = tuple[str, int, int]  # kind, twin, seed
 
 
 class Trial(NamedTuple):
@@ -126,66 +119,40 @@ class Trial(NamedTuple):
 
     @property
     def result(self) -> str:
-        """File of the outcome, in the folder."""
-        return f"trials/{self.kind}-twin{self.twin}-seed{self.seed}-{self.variant.replace(' ', '-')}.npz"
+        """File of the figures, in the folder."""
+        return f"trials/{self.kind}-twin{self.twin}-seed{self.seed}-{self.variant.replace(' ', '-')}.json"
 
     @property
     def log(self) -> str:
         """File of the log, in the folder."""
-        return self.result.replace(".npz", "-log.npz")
+        return self.result.replace(".json", "-log.npz")
+
+    @property
+    def logged(self) -> bool:
+        """Whether the log is kept, to be drawn over time."""
+        return self.kind == "with" and self.load_g in TRACED_G and not self.lap_s
 
 
 def trials(experiment: str, settings: Settings) -> list[Trial]:
-    """Return the trials of an experiment."""
-    makers = {"open": _open_trials, "confined": _confined_trials}
-    return makers[experiment](settings) if experiment in makers else []
-
-
-def _open_trials(settings: Settings) -> list[Trial]:
-    loads_g, listed = (0, *settings.loads_g), []
-    for twin, seed in arms_and_seeds(settings):
-        listed += [Trial(kind, twin, seed) for kind in ("specified", "without")]
+    """Return the trials of "open" or "confined"."""
+    listed = []
+    if experiment == "confined":
+        for run in settings.runs:
+            listed += [Trial(kind, *run, "as shown") for kind in PIPE_KINDS]
+            listed += [Trial("pipe", *run, "exchanged"), Trial("pipe", *run, "as shown", moves=True)]
+        return listed
+    loads_g = (0, *settings.loads_g)
+    for run in settings.runs:
+        listed += [Trial(kind, *run) for kind in ("specified", "without")]
         for kind in ("with", *settings.beside):
-            moving = kind.startswith("motion")
-            listed += [Trial(kind, twin, seed, load_g=load_g) for load_g in ((0,) if moving else loads_g)]
-            if moving or kind == "with":
-                listed += [Trial(kind, twin, seed, lap_s=lap_s) for lap_s in IN_TIME_S]
+            listed += [Trial(kind, *run, load_g=load_g) for load_g in ((0,) if kind == "motion" else loads_g)]
+            if kind in ("with", "motion"):
+                listed += [Trial(kind, *run, lap_s=lap_s) for lap_s in IN_TIME_S]
     # Without S2R one seed is enough. Gradient descent is not trained, so it runs once for each load.
-    first = settings.seeds[0]
     for twin in settings.twins:
-        listed.append(Trial("chambers", twin, first))
-        listed += [Trial("gradient", twin, first, load_g=load_g) for load_g in loads_g]
+        listed.append(Trial("chambers", twin, settings.seeds[0]))
+        listed += [Trial("gradient", twin, settings.seeds[0], load_g=load_g) for load_g in loads_g]
     return listed
-
-
-def _confined_trials(settings: Settings) -> list[Trial]:
-    listed = [Trial(*key, "as shown") for key in pipe_policies(settings)]
-    for twin, seed in arms_and_seeds(settings):
-        listed.append(Trial("pipe", twin, seed, "exchanged"))
-        listed.append(Trial("pipe", twin, seed, "as shown", moves=True))
-    return listed
-
-
-def traced(settings: Settings) -> list[Trial]:
-    """Return the trials whose logs are kept and drawn."""
-    first = Trial("with", settings.twins[0], settings.seeds[0])
-    return [first._replace(load_g=load_g) for load_g in TRACED_G if load_g in (0, *settings.loads_g)]
-
-
-def filmed(experiment: str, settings: Settings) -> Trial:
-    """Return the trial that is filmed."""
-    first = settings.twins[0], settings.seeds[0]
-    return Trial("with", *first) if experiment == "open" else Trial("pipe", *first, "as shown")
-
-
-def pipe_policies(settings: Settings) -> list[PolicyKey]:
-    """Return all policies that are learned from demonstrations."""
-    return [(kind, *run) for kind in PIPE_KINDS for run in arms_and_seeds(settings)]
-
-
-def arms_and_seeds(settings: Settings) -> list[tuple[int, int]]:
-    """Return all pairs of a twin and a training seed."""
-    return [(twin, seed) for twin in settings.twins for seed in settings.seeds]
 
 
 def arm_name(twin: int | None) -> str:
@@ -193,21 +160,12 @@ def arm_name(twin: int | None) -> str:
     return "nominal" if twin is None else f"twin{twin}"
 
 
-def s2r_path(twin: int) -> str:
-    """Return the path of the errors of an arm's sim-to-real networks in the folder."""
-    return f"{arm_name(twin)}/s2r.json"
-
-
 def demonstrations_path(twin: int, task: str) -> str:
     """Return the path of a twin's demonstrations of a task in the folder."""
-    return f"twin{twin}/demos-{task}.npz"
+    return f"{arm_name(twin)}/demos-{task}.npz"
 
 
 def run_path(kind: str, twin: int | None, seed: int) -> str:
-    """Return the run folder of a kind's policy, or of the one whose arm its solver takes.
-
-    The runs of "with" and, on the nominal arm, of "specified" have no kind in their names.
-    """
-    arm = arm_name(None if kind == "specified" else twin)
-    own = "" if kind in ("specified", "without", "with", "gradient") else f"{kind}-"
-    return f"{own}{arm}-seed{seed}"
+    """Return the run folder of a kind's policy, or of the one whose arm its solver takes."""
+    policy = "with" if kind in ("without", "gradient") else kind
+    return f"{policy}-{arm_name(None if kind == 'specified' else twin)}-seed{seed}"

@@ -20,6 +20,7 @@ import importlib
 import math
 import sys
 import time
+import timeit
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -31,6 +32,7 @@ START = time.perf_counter()
 
 CONTESTANTS = ("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight")
 CHUNK = 512  # env steps in a call of `learn`
+N_STORED = 100_000  # transitions for the choice of threads
 
 
 class Contestant(NamedTuple):
@@ -106,43 +108,45 @@ def peer(name: str, seed: int) -> Contestant:
     from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
 
     from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer, with_goals
-    from benchmarks.race.threads import choose_threads, filled_model
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
     from train.agent.tqc import TQCConfig
     from train.presets import PRESETS
 
-    # Choose PyTorch's threads on a throwaway model; this time does not count.
     config, library = PRESETS["quick"], library_of(name)
-    ours = cast(TQCConfig, config.learner)
+    ours, n_steps = cast(TQCConfig, config.learner), 0
     algorithm = importlib.import_module(library.replace("-", "_")).TQC
+    arms = SoftArmVectorEnv(ours.n_arms, ours.episode_length, config=config.env)
+    # PyTorch's threads; choosing them does not count
     start = time.perf_counter()
     if library == "sb3-contrib":
-        throwaway = filled_model(algorithm)
+        throwaway = algorithm("MlpPolicy", as_sb3(arms), buffer_size=N_STORED)
+        throwaway.set_logger(Logger(None, []))
+        fill(throwaway.replay_buffer)
         choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=ours.batch_size))
     uncounted_s = time.perf_counter() - start
-    # The arms, and the algorithm with our settings.
-    arms, n_steps = SoftArmVectorEnv(ours.n_arms, ours.episode_length, config=config.env), 0
+    # The algorithm with our settings
+    hindsight = {
+        "arm": arms.env,
+        "hindsight": ours.hindsight,
+        "reward_scale": ours.reward_scale,
+        "seed": seed,
+    }
     model = algorithm(
         "MultiInputPolicy",
         GoalEnvs(as_sb3(arms), ours.reward_scale),
         seed=seed,
         replay_buffer_class=HindsightBuffer,
-        replay_buffer_kwargs={
-            "arm": arms.env,
-            "hindsight": ours.hindsight,
-            "reward_scale": ours.reward_scale,
-            "seed": seed,
-        },
+        replay_buffer_kwargs=hindsight,
         **settings_of(ours, lambda: n_steps),
     )
     model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
 
-    # Train until the first updates are done.
     def learn(n: int, **more: Any) -> None:
         nonlocal n_steps
         model.learn(n, **more)
         n_steps = model.num_timesteps
 
+    # Train until the first updates are done
     learn(model.learning_starts + ours.n_arms)
     return Contestant(
         train=lambda: learn(CHUNK, reset_num_timesteps=False),
@@ -150,6 +154,27 @@ def peer(name: str, seed: int) -> Contestant:
         done=lambda: (n_steps, model._n_updates),
         uncounted_s=uncounted_s,
     )
+
+
+def fill(replay: Any) -> None:
+    """Fill a replay buffer of Stable-Baselines3 with random numbers."""
+    rng = np.random.default_rng(0)
+    for rows in (replay.observations, replay.next_observations, replay.rewards):
+        rows[:] = rng.normal(size=rows.shape)
+    replay.actions[:] = np.tanh(rng.normal(size=replay.actions.shape))
+    replay.full = True
+
+
+def choose_threads(train: Callable[[], Any]) -> None:
+    """Let PyTorch use all its threads, or one where the fastest of three calls is faster with it."""
+    import torch  # pyright: ignore[reportMissingImports]
+
+    times = {}
+    for n_threads in (torch.get_num_threads(), 1):
+        torch.set_num_threads(n_threads)
+        train()  # the first call with a number of threads is slow
+        times[n_threads] = min(timeit.repeat(train, number=1, repeat=3))
+    torch.set_num_threads(min(times, key=lambda n: times[n]))
 
 
 def settings_of(tqc: Any, n_steps: Callable[[], int]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ evaluation; `contestants` says how each trains. They run one after another, each
 all cores. Ours with the presets quick and analytic go first; analytic trains to the finest level, or to its
 end. A peer is stopped when it has reached all levels that quick has, or when its targets are met.
 
-Results stay in the working folder: the same command continues an interrupted race, and seeds may be added.
+Results stay in the working folder: the same command continues an interrupted race, and adds seeds.
 A target compares one of our presets with a peer: TQC with TQC, and learning through the equilibrium with SBX.
 """
 
@@ -13,23 +13,24 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness.common import machine_kind, names_of, save, show, status_of, target
-from benchmarks.harness.peers import PINS, PeerError, peer_python
-from benchmarks.harness.rounds import Facts, Worker, WorkerError
-from benchmarks.harness.stages import difference
+from benchmarks.harness.common import grouped, machine_kind, save, show, status_of, target
+from benchmarks.harness.peers import PINS, peer_python
+from benchmarks.harness.rounds import Facts, Worker
+from benchmarks.harness.stages import claim
 from benchmarks.race.contestants import CONTESTANTS, library_of
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 
 N_STRETCHES = 40  # of training between evaluations, up to a peer's limit
+N_GOALS = 2_000
 LEVELS_MM = (10, 5, 3, 2, 1)
 TARGET_MM = 5
 FIRST = "ours-quick"
@@ -61,117 +62,79 @@ class RaceLimits(NamedTuple):
     stretch_s: float = 0.0  # of training between evaluations, not a limit
 
 
-def race(
-    seeds: cli.Integers = (0,),
-    only: Annotated[tuple[str, ...], names_of(CONTESTANTS)] = CONTESTANTS,
-    out: cli.MaybePath = None,
-) -> int:
+def race(seeds: cli.Integers = (0,), out: Path = Path("runs/race")) -> int:
     """How long does learning take to a tip error, beside SBX and sb3-contrib? Half an hour a seed.
 
     Args:
         seeds: of training
-        only: contestants, beside ours-quick and those with results in the folder
-        out: working folder; None: runs/race
+        out: working folder
 
     Raises:
-        InputError: ours-quick failed, or the folder has results of other conditions.
+        InputError: one of ours failed, or the folder has results of other conditions.
     """
-    figures = summarise(run(out or Path("runs/race"), seeds, only))
+    made = provenance("benchmarks")
+    conditions = {name: made[name] for name in ("packages", "commit")}
+    claim(out, {"n_goals": N_GOALS, "peers": PINS, "machine": machine_kind(), **conditions})
+    figures = summarise([result for seed in seeds for result in run(out, seed)])
     show({name: value for name, value in figures.items() if name != "curves"}, "race")
-    if any(row["contestant"] == FIRST for row in figures["failed"]):
-        raise InputError(f"{FIRST}: got a failure, expected a result, without which there is no race")
     print(f"written: {save('race', figures)}")
     return status_of(figures)
 
 
-def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int = 2_000) -> list[Facts]:
-    """Return the results of the contestants, and of others that the folder has; missing ones are measured.
+def run(folder: Path, seed: int) -> list[Facts]:
+    """Return the results of all contestants; those that the folder lacks are measured.
 
-    One that fails has `failed` in place of points. If it is the first of a seed, that seed has no others:
-    their limits follow from it.
+    A peer that fails has `failed` in place of points.
 
     Raises:
-        InputError: a result in the folder was measured under other conditions.
+        InputError: one of ours failed.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    results = []
-    for seed in seeds:
-        first = _result(folder, FIRST, seed, RaceLimits(), n_goals)
-        ours = [first]
-        results.append(first)
-        for name in CONTESTANTS:
-            wanted = name in names or _file(folder, name, seed).exists()
-            if name != FIRST and wanted and "failed" not in first:
-                found = _result(folder, name, seed, limits_of(name, ours), n_goals)
-                results.append(found)
-                ours += [found] * name.startswith("ours")
+    results: list[Facts] = []
+    for name in CONTESTANTS:
+        file, who, ours = folder / f"{name}-seed{seed}.json", f"{name}, seed {seed}", name.startswith("ours")
+        if file.exists():
+            results.append(json.loads(file.read_text("utf-8")))
+            continue
+        limits = limits_of(name, [result for result in results if result["contestant"].startswith("ours")])
+        program = ["benchmarks.race.contestants", name, str(seed), str(limits.stretch_s), str(N_GOALS)]
+        results.append({"contestant": name, "seed": seed})
+        try:
+            python = None if ours else peer_python(library_of(name))
+            results[-1] |= train(Worker(who, program, python), limits)
+        except InputError as error:
+            if ours:
+                raise
+            print(f"{who}: failed: {error}")
+            results[-1]["failed"] = str(error)
+            continue
+        write_json(file, results[-1])
     return results
 
 
 def limits_of(name: str, ours: Sequence[Facts]) -> RaceLimits:
     """Return a contestant's limits, by the curves of ours that raced before it, quick's first."""
-    reached_mm = [level for level in LEVELS_MM if crossing(ours[0]["points"], level, "wall_s") is not None]
+    if not ours:
+        return RaceLimits()
+    quick = ours[0]["points"]
+    reached_mm = [level for level in LEVELS_MM if crossing(quick, level, "wall_s") is not None]
     times_s = {
         raced["contestant"]: crossing(raced["points"], TARGET_MM, "wall_s") or raced["points"][-1]["wall_s"]
         for raced in ours
-        if "points" in raced
     }
     peer = "sbx-hindsight" if name == "ours-analytic" else name  # ours is evaluated as often as SBX
-    wall_s = max(
-        wanted.times * times_s[wanted.ours]
-        for wanted in TARGETS
-        if wanted.peer == peer and wanted.ours in times_s
-    )
-    if name != peer:
+    wall_s = max(wanted.times * times_s.get(wanted.ours, 0.0) for wanted in TARGETS if wanted.peer == peer)
+    if name == "ours-analytic":
         return RaceLimits(target_mm=min(LEVELS_MM), stretch_s=wall_s / N_STRETCHES)
     return RaceLimits(wall_s, min(reached_mm, default=0), wall_s / N_STRETCHES)
-
-
-def _file(folder: Path, name: str, seed: int) -> Path:
-    return folder / f"{name}-seed{seed}.json"
-
-
-def _result(folder: Path, name: str, seed: int, limits: RaceLimits, n_goals: int) -> dict[str, Any]:
-    """Return the result of one contestant, measured now or before."""
-    file, who = _file(folder, name, seed), f"{name}, seed {seed}"
-    # Take a result in the folder if it was measured under the same conditions.
-    made = provenance("benchmarks")
-    conditions: dict[str, Any] = {
-        "n_goals": n_goals,
-        "peers": {library: list(packages) for library, packages in PINS.items()},
-        "packages": made["packages"],
-        "machine": machine_kind(),
-        "commit": made["commit"],
-    }
-    if file.exists():
-        result = json.loads(file.read_text("utf-8"))
-        if differing := difference(result.get("conditions", {}), conditions):
-            raise InputError(f"{file}: {differing}; choose another --out, or remove the file")
-        print(f"{who}: measured before, in {file}")
-        return result
-    # Measure a missing one; ours runs in this environment, a peer in its own.
-    program = ["benchmarks.race.contestants", name, str(seed), str(limits.stretch_s), str(n_goals)]
-    result = {"contestant": name, "seed": seed, "conditions": conditions}
-    result |= {key: made[key] for key in ("commit", "uncommitted_changes")}
-    try:
-        ours = name.startswith("ours")
-        worker = Worker(who, program, None if ours else peer_python(library_of(name)))
-        result |= train(worker, limits)
-    except (PeerError, WorkerError) as error:
-        print(f"{who}: failed: {error}", file=sys.stderr)
-        return {**result, "failed": str(error)}
-    write_json(file, result)
-    return result
 
 
 def train(worker: Worker, limits: RaceLimits) -> dict[str, Any]:
     """Let a contestant train until its end or a limit; returns start-up time, time limit and curve."""
     limit_s = limits.wall_s if math.isfinite(limits.wall_s) else None
-    until = f" up to {limit_s:.0f} s," if limit_s else ""
-    print(f"{worker.name}:{until} evaluations not counted ...", flush=True)
+    print(f"{worker.name}: up to {limits.wall_s:.0f} s, evaluations not counted ...", flush=True)
     points: list[Facts] = []
     ended = False
-    try:
+    with closing(worker):
         worker.start()
         while not ended:
             point = worker.round()
@@ -181,8 +144,6 @@ def train(worker: Worker, limits: RaceLimits) -> dict[str, Any]:
             done = f"{point['env_steps']:,} env steps, {point['updates']:,} updates"
             print(f"{worker.name}: {point['wall_s']:.0f} s, {done}, median {error_mm:.2f} mm", flush=True)
             ended |= point["wall_s"] >= limits.wall_s or error_mm <= limits.target_mm
-    finally:
-        worker.close()
     return {"start_up_s": worker.facts["start_up_s"], "limit_s": limit_s, "points": points}
 
 
@@ -206,30 +167,25 @@ def median_mm(point: Point) -> float:
 
 
 def summarise(results: Sequence[Result]) -> dict[str, Any]:
-    """Return times to each level with start-up and without, env steps, targets, failures and the curves."""
+    """Return times to each level with start-up and without, targets, failures and the curves."""
     ran = [result for result in results if "points" in result]
     return {
         "wall_s": [_row(result, "wall_s") for result in ran],
         "wall_s_without_start_up": [_row(result, "trained_s") for result in ran],
-        "env_steps": [_row(result, "env_steps") for result in ran],
         "targets": [judge(wanted, results) for wanted in TARGETS],
-        "failed": [
-            {key: r[key] for key in ("contestant", "seed", "failed")} for r in results if "failed" in r
-        ],
+        "failed": [result for result in results if "failed" in result],
         "curves": results,
     }
 
 
 def _row(result: Result, axis: str) -> dict[str, Any]:
-    """Return a contestant's time or env steps to each level; for a missed level, the limit that it had."""
+    """Return a contestant's time to each level; for a missed level, the time that it had."""
     points = result["points"]
     last = points[-1][axis]
-    row = {key: result[key] for key in ("contestant", "seed")}
-    if axis == "wall_s":
-        row["start_up"] = round(result["start_up_s"], 1)
+    row = {key: result[key] for key in ("contestant", "seed", "start_up_s")}
     for level in LEVELS_MM:
-        found = crossing(points, level, axis)
-        row[f"to_{level}_mm"] = f"not within {last:,.0f}" if found is None else round(found, 1)
+        time_s = crossing(points, level, axis)
+        row[f"to_{level}_mm"] = f"not within {last:,.0f}" if time_s is None else round(time_s, 1)
     return row | {"best_mm": round(min(map(median_mm, points)), 2), "in_all": round(last)}
 
 
@@ -240,21 +196,16 @@ def judge(wanted: PeerTarget, results: Sequence[Result]) -> dict[str, str]:
     """
     peer, times, ours = wanted
     text = f"{peer}: wall time to {TARGET_MM} mm, with start-up, at least {times:g} times that of {ours}"
-    for result in results:
-        if "failed" in result and result["contestant"] in (ours, peer):
-            failure = f"{result['contestant']}, seed {result['seed']}: {result['failed']}"
-            return target(text, failure, False if result["contestant"] == ours else None)
-    curves: dict[tuple[str, int], Any] = {(r["contestant"], r["seed"]): r.get("points") for r in results}
     ratios, all_reached = [], True
-    for seed in sorted({seed for _, seed in curves}):
-        missing = [name for name in (ours, peer) if (name, seed) not in curves]
-        if missing:
-            return target(text, f"not raced: {' and '.join(missing)}, seed {seed}", None)
-        ours_s, theirs_s = (crossing(curves[name, seed], TARGET_MM, "wall_s") for name in (ours, peer))
+    for (seed,), raced in grouped(results, ("seed",)).items():
+        curves: dict[str, Any] = {result["contestant"]: result.get("points") for result in raced}
+        if not curves[peer]:
+            return target(text, f"{peer}, seed {seed}: failed", None)
+        ours_s, theirs_s = (crossing(curves[name], TARGET_MM, "wall_s") for name in (ours, peer))
         if ours_s is None:
             return target(text, f"ours did not reach it with seed {seed}", False)
         all_reached &= theirs_s is not None
-        ratios.append((theirs_s or curves[peer, seed][-1]["wall_s"]) / ours_s)
+        ratios.append((theirs_s or curves[peer][-1]["wall_s"]) / ours_s)
     ratio = float(np.median(ratios))
     met = None if ratio < times and not all_reached else ratio >= times
     return target(text, f"{'' if all_reached else 'not within '}{ratio:.2f} times", met)

@@ -2,7 +2,7 @@
 
     python -m benchmarks guard            compare, for use before a release, in about four minutes
     python -m benchmarks guard --store    make this the baseline of this kind of machine
-    python -m benchmarks.speed.guard      the worker: one process of a measurement
+    python -m benchmarks.speed.guard      one process of a measurement
 
 A cost is the least time of some work over the least time of matrix products in the same process, because a
 disturbance only adds. A comparison takes the median of three processes. The baseline has five; its tolerance
@@ -15,6 +15,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -23,7 +26,7 @@ import jax
 import numpy as np
 
 from benchmarks.harness.common import RESULTS, cpu_kind, show
-from benchmarks.harness.rounds import Facts, Worker, WorkerError, serve, working
+from benchmarks.harness.rounds import ROOT
 from benchmarks.speed.truth import random_references, settle_function
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
@@ -39,6 +42,7 @@ MARGIN, LEAST_TOLERANCE, MOST_TOLERANCE = 2.0, 0.1, 0.25
 WORSE = 1  # exit status
 SIZES = {"n_arms": 128, "n_settles": 20, "n_env_steps": 16, "n_updates": 16, "batch_size": 256}
 SIZES |= {"n_rows": 1024, "n_products": 8, "n_compiles": 2}
+MODULE = "benchmarks.speed.guard"
 WORK = ("settle", "epoch", "compile")
 
 Costs = Mapping[str, float]  # of one process, by the name of the work
@@ -60,10 +64,7 @@ def main(store: bool = False) -> int:
     stored = kinds.get(kind, {})
     if not store and stored.get("sizes") != SIZES:
         raise InputError(f"{FILE}: got no baseline of this work on {kind}, expected one: guard --store")
-    try:
-        samples = [process_costs() for _ in range(N_STORED if store else N_PROCESSES)]
-    except WorkerError as error:
-        raise InputError(error.reason) from error
+    samples = [process_costs() for _ in range(N_STORED if store else N_PROCESSES)]
     # Compare with it.
     if not store:
         rows = compare(stored["costs"], samples)
@@ -81,11 +82,16 @@ def main(store: bool = False) -> int:
 
 
 def process_costs() -> dict[str, float]:
-    """Return the costs that one process on one core measures, by the name of the work."""
-    with working(worker := Worker("guard", ["benchmarks.speed.guard"], n_cores=1)):
-        rounds = [worker.facts | worker.round() for _ in range(N_ROUNDS)]
-    least = {name: min(seconds[name] for seconds in rounds) for name in rounds[0]}
-    return {name: least[name] / least["product"] for name in WORK}
+    """Return the costs that one process on one core measures, by the name of the work.
+
+    Raises:
+        InputError: the process failed.
+    """
+    words = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0))), sys.executable, "-m", MODULE]
+    done = subprocess.run(words, stdout=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    if done.returncode:
+        raise InputError(f"{' '.join(words)}: got status {done.returncode}, expected costs")
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def baseline_of(samples: Sequence[Costs]) -> dict[str, dict[str, Any]]:
@@ -107,13 +113,13 @@ def compare(baseline: Mapping[str, Mapping[str, Any]], samples: Sequence[Costs])
         now, tolerance = float(np.median([sample[name] for sample in samples])), stored["tolerance"]
         change = now / stored["cost"] - 1.0
         verdict = "WORSE" if change > tolerance else "better" if change < -tolerance else "same"
-        told = {"verdict": verdict, "change": f"{change:+.1%}", "tolerance": f"{tolerance:.1%}"}
-        rows.append({"work": name, "baseline": stored["cost"], "now": now, **told})
+        shares = {"change": f"{change:+.1%}", "tolerance": f"{tolerance:.1%}"}
+        rows.append({"work": name, "baseline": stored["cost"], "now": now, "verdict": verdict, **shares})
     return rows
 
 
-def prepare() -> tuple[Facts, Callable[[], Facts]]:
-    """Compile in the worker; return the seconds of compiling, and a function that measures the other work."""
+def measure_costs() -> dict[str, float]:
+    """Return the costs of compiling, settling and training in this process, by the name of the work."""
     # A training job in one process, without a cache of compiled programs.
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_enable_compilation_cache", False)
@@ -130,8 +136,8 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
         job = Job(epoch_of(config, env))
         job.compile_epoch()
 
-    # Compile its epoch, and prepare the other work.
-    compiling_s = min(_seconds(compile_epoch) for _ in range(SIZES["n_compiles"]))
+    # Compile its epoch, and prepare the other work, whose first calls do not count.
+    compiling_s = [_seconds(compile_epoch) for _ in range(SIZES["n_compiles"])]
     matrix = np.random.default_rng(0).normal(size=(SIZES["n_rows"],) * 2).astype(np.float32)
     solve, references = settle_function(env.spec), random_references(env.spec, n_arms).astype(np.float32)
     work = {
@@ -139,10 +145,12 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
         "settle": lambda: [solve(references) for _ in range(SIZES["n_settles"])],
         "epoch": lambda: states.append(job.epoch(states.pop())[0]) or states,
     }
-    # The first call of each does not count.
     for call in work.values():
         jax.block_until_ready(call())
-    return {"compile": compiling_s}, lambda: {name: _seconds(call) for name, call in work.items()}
+    rounds = [{name: _seconds(call) for name, call in work.items()} for _ in range(N_ROUNDS)]
+    least_s = {name: min(seconds[name] for seconds in rounds) for name in work}
+    least_s["compile"] = min(compiling_s)
+    return {name: least_s[name] / least_s["product"] for name in WORK}
 
 
 def _seconds(call: Callable[[], Any]) -> float:
@@ -153,4 +161,4 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 if __name__ == "__main__":
-    serve(prepare)
+    print(json.dumps(measure_costs()))

@@ -1,72 +1,72 @@
 """Speed and error of methods that find an arm's equilibrium, over links per section.
 
 The methods are Newton's method with the closed-form chain, the same with MJX kinematics, and C MuJoCo stepped
-in time under the control law. Each is a process of its own, and they take turns round by round, on all cores;
-one that fails has a row that says why. Errors are distances of the tip from the solution in double precision,
-which `tests/mechanics/test_settle.py` compares with C MuJoCo stepped to rest. A second table has arms that
-hang, lie and stand.
+in time under the control law. They take turns, on all cores. Errors are distances of the tip from the
+solution in double precision, which `tests/mechanics/test_settle.py` compares with C MuJoCo stepped to rest.
 """
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
+from jax.sharding import Mesh
 
-from benchmarks.harness.rounds import Facts, Worker, take_turns
-from benchmarks.speed import postures
-from benchmarks.speed.throughput import N_ROUNDS, over_rounds
-from benchmarks.speed.truth import Truth, error_figures, random_references, true_rest
+from benchmarks.harness.common import n_cores
+from benchmarks.speed.jax_worker import Program, digits, mesh_of_cores, rates
+from benchmarks.speed.mujoco_arms import SteppedArms
+from benchmarks.speed.truth import Truth, error_figures, random_references, settle_function, true_rest
 from mjx_softarm.spec import ArmSpec
+from train.epoch.devices import split
 
 LINKS = (2, 4, 10)  # per section
 MOST_LINKS_MJX = 6
 NO_MJX = f"compiles for minutes and in gigabytes at {MOST_LINKS_MJX} links, and for longer at more"
-N_ARMS = 512
-METHODS = ("chain", "mjx", "stepping")
+N_ARMS, N_STEPPED = 512, 64  # references of a solver, and of C MuJoCo, which takes the first
+N_ROUNDS, ROUND_S = 3, 1.0
 
 
 def measure() -> dict[str, Any]:
     """How fast and how exactly is an arm's equilibrium found?"""
-    over_links = [row for links in LINKS for row in _methods_rows(links)]
-    return {"over_links": over_links, "postures": postures.rows()}
+    mesh = mesh_of_cores(N_ARMS)
+    return {"over_links": [row for links in LINKS for row in methods_rows(links, mesh)]}
 
 
-def _methods_rows(links: int) -> list[dict[str, Any]]:
+def methods_rows(links: int, mesh: Mesh | None) -> list[dict[str, Any]]:
     """Return a row for each method, with a number of links per section."""
-    # References, and their equilibria in double precision.
+    # Functions that return tips [m]; the first call of each compiles.
     spec = ArmSpec.default().replace(structure={"links_per_section": links})
     reference_m = random_references(spec, N_ARMS)
-    truth, workers = true_rest(spec, reference_m), {}
+    truth = true_rest(spec, reference_m)
+    methods = {
+        "chain": _solver(spec, "chain", reference_m, mesh),
+        "mjx": _solver(spec, "mjx", reference_m, mesh) if links <= MOST_LINKS_MJX else None,
+        "stepping": lambda: SteppedArms(spec, N_STEPPED, n_cores()).settle(reference_m[:N_STEPPED]).tip_m,
+    }
+    tips_mm = {name: 1e3 * np.asarray(solve(), float) for name, solve in methods.items() if solve}
+    programs = {name: Program(0.0, methods[name], len(tips_mm[name])) for name in tips_mm}
     # The methods take turns.
-    with tempfile.TemporaryDirectory() as folder:
-        file = str(Path(folder, "references.npy"))
-        np.save(file, reference_m)
-        for method in METHODS if links <= MOST_LINKS_MJX else ("chain", "stepping"):
-            program = ["benchmarks.speed.jax_worker", "settle", method, file, str(links)]
-            if method == "stepping":
-                program = ["benchmarks.speed.mujoco_worker", "settle", file, str(links)]
-            workers[method] = Worker(f"{method}, {links} links per section", program)
-        rounds, failed = take_turns(list(workers.values()), N_ROUNDS)
-    # A row for each, whether it was measured or not.
+    rounds = [
+        {name: rates(program, ROUND_S)["env_steps_per_s"] for name, program in programs.items()}
+        for _ in range(N_ROUNDS)
+    ]
     rows = []
-    for method in METHODS:
-        row = {"links_per_section": links, "share_at_limit": round(truth.share_at_limit, 3), "method": method}
-        if method not in workers:
-            figures: dict[str, Any] = {"skipped": NO_MJX}
-        elif (worker := workers[method]).name in failed:
-            figures = {"failed": failed[worker.name]}
-        else:
-            figures = method_figures(rounds[worker.name], truth) | worker.facts
-        rows.append(row | figures)
+    for name in methods:
+        row = {"links_per_section": links, "share_at_limit": round(truth.share_at_limit, 3), "method": name}
+        if name not in tips_mm:
+            rows.append({**row, "skipped": NO_MJX})
+            continue
+        n = len(tips_mm[name])
+        first = Truth(truth.tip_mm[:n], truth.settled[:n], truth.share_at_limit)
+        rate = digits(float(np.median([rates[name] for rates in rounds])))
+        rows.append({**row, **error_figures(tips_mm[name], first), "solves_per_s": rate})
     return rows
 
 
-def method_figures(rounds: Sequence[Facts], truth: Truth) -> dict[str, Any]:
-    """Return figures of a method's rounds; it may have taken the first n of the references alone."""
-    tip_mm, n = np.array(rounds[-1]["tip_mm"]), len(rounds[-1]["tip_mm"])
-    first = Truth(truth.tip_mm[:n], truth.settled[:n], truth.share_at_limit)
-    return {**error_figures(tip_mm, first), **over_rounds(rounds)}
+def _solver(spec: ArmSpec, engine: str, reference_m: np.ndarray, mesh: Mesh | None) -> Callable[[], Any]:
+    """Return a function that settles references (n, n_springs) [m] and returns tips (n, 3) [m]."""
+    solve = settle_function(spec, engine, mesh=mesh)
+    placed = jax.device_put(reference_m.astype(np.float32), split(mesh) if mesh else None)
+    return lambda: solve(placed).tip_position_m

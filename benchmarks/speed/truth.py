@@ -5,7 +5,6 @@ The truth is the solution in double precision; `tests/mechanics/test_settle.py` 
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -51,23 +50,13 @@ def settle_function(
     return xla.jit(over_arms(at_rest, mesh))
 
 
-@functools.lru_cache(maxsize=8)
-def _solver(spec: ArmSpec) -> Callable:
-    return settle_function(spec, dtype=np.float64)
-
-
 def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
     """Return the equilibria of arms under the control law, at references (n, n_springs) [m]."""
-    found = rest_of(spec, reference_m)
-    settled = np.asarray(found.settled)
-    tip_mm = 1e3 * np.asarray(found.tip_position_m)
-    return Truth(tip_mm, settled, float(np.mean(found.at_limit[settled])))
-
-
-def rest_of(spec: ArmSpec, reference_m: np.ndarray) -> solver.Settled:
-    """Return arms settled in double precision, at references (n, n_springs) [m]."""
     with jax.enable_x64(True):
-        return jax.device_get(_solver(spec)(jnp.asarray(reference_m, np.float64)))
+        solve = settle_function(spec, dtype=np.float64)
+        solution = jax.device_get(solve(jnp.asarray(reference_m, np.float64)))
+    share_at_limit = float(np.mean(solution.at_limit[solution.settled]))
+    return Truth(1e3 * solution.tip_position_m, solution.settled, share_at_limit)
 
 
 def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
@@ -80,12 +69,12 @@ def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
     return {**errors, "without_truth": int(np.sum(~truth.settled))}
 
 
-def reported_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the error of the tips that workers told; nothing if they told none."""
-    told = [facts for facts in told if "tip_mm" in facts]
-    if not told:
+def reported_error(spec: ArmSpec, answers: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the error of the tips that a worker's answers report; nothing if none has any."""
+    answers = [facts for facts in answers if "tip_mm" in facts]
+    if not answers:
         return {}
-    reference_m, tip_mm = (np.concatenate([facts[name] for facts in told]) for name in REPORTED)
+    reference_m, tip_mm = (np.concatenate([facts[name] for facts in answers]) for name in REPORTED)
     return error_figures(tip_mm, true_rest(spec, reference_m))
 
 

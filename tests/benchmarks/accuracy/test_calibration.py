@@ -1,4 +1,4 @@
-"""Readers of public logs, what detectors and fits find in the real ones; the planted arm."""
+"""Real logs: their readers, what detectors and fits find in them; the planted arm."""
 
 from pathlib import Path
 
@@ -8,32 +8,43 @@ import pytest
 from benchmarks.accuracy import calibration as logs
 from benchmarks.accuracy.calibration import planted_arm, read_asu, read_trunk
 from mjx_softarm.logs import checks
-from mjx_softarm.logs.checks import LogError
 
 DATA = Path(__file__).parents[3].parent / "shared/data"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the real logs are not beside the checkout")
-PSI = 6.894757293
+PSI_KPA = 6.894757293
+
+
+def raw_trunk(number):
+    """Return a log of the trunk with its columns by name, and its quaternions (n, 3, 4)."""
+    path = DATA / logs.TRUNK_LOG.format(number)
+    table = np.genfromtxt(path, delimiter=",", names=True)
+    parts = [f"{part}{disk}" for disk in (1, 2, 3) for part in ("w", "qx", "qy", "qz")]
+    known = [name for name in parts if name in table.dtype.names]
+    return table, np.stack([table[name] for name in known], axis=1).reshape(-1, 3, 4) if known else None
+
+
+def assert_one_motion(quaternion, least):
+    """Once they have one sign, quaternions (n, 4) change little from row to row."""
+    kept, _ = checks.same_sign(quaternion)
+    assert ((kept[1:] * kept[:-1]).sum(axis=1) > least).all()
 
 
 @real
 @pytest.mark.parametrize(("number", "n_rows", "n_stale"), [(1, 15_001, 14), (11, 6_001, 281)])
 def test_real_trunk(number, n_rows, n_stale):
-    path = DATA / f"asl_trunk/observations_controlled_{number}.csv"
-    log, raw = read_trunk(path), np.genfromtxt(path, delimiter=",", names=True)
+    log, (raw, _) = read_trunk(DATA / logs.TRUNK_LOG.format(number)), raw_trunk(number)
     assert len(log.fresh) == n_rows and np.count_nonzero(~log.fresh) == n_stale
-    np.testing.assert_array_equal(log.position_m[:, 2, 1], raw["y3"])
+    np.testing.assert_array_equal(log.tip_m[:, 1], raw["y3"])
     np.testing.assert_array_equal(log.motor_deg[:, 4], raw["phi5"])
 
 
 @real
 def test_real_trunk_turned_tip():
-    log = read_trunk(DATA / "asl_trunk/observations_controlled_11.csv")
-    assert [np.count_nonzero(checks.turned_rows(log.quaternion[:, k])) > 0 for k in range(3)] == [0, 1, 1]
-    turned = checks.turned_rows(log.quaternion[:, 2])
-    assert np.count_nonzero(turned) == 51
-    kept, _ = checks.same_sign(log.quaternion[~turned, 2])  # one continuous motion
-    assert ((kept[1:] * kept[:-1]).sum(axis=1) > np.cos(np.radians(15.0))).all()
-    assert read_trunk(DATA / "asl_trunk/observations_controlled_1.csv").quaternion is None
+    _, quaternion = raw_trunk(11)
+    turned = [checks.turned_rows(quaternion[:, k]) for k in range(3)]
+    assert [np.count_nonzero(rows) > 0 for rows in turned] == [0, 1, 1]
+    assert np.count_nonzero(turned[2]) == 51
+    assert_one_motion(quaternion[~turned[2], 2], np.cos(np.radians(15.0)))
 
 
 @real
@@ -42,17 +53,15 @@ def test_real_trunk_turned_tip():
     [("apr5", 4_338, 0.70, (0, 0, 40)), ("apr4", 1_773, 0.59, (0, 6, 298))],
 )
 def test_real_asu(name, n_rows, share, jumps):
-    path = DATA / f"asu_softarm/{name}_data_collect_1.txt"
-    log, raw = read_asu(path), np.loadtxt(path, delimiter=",")
+    log, raw = read_asu(DATA / logs.ASU_LOGS[name]), np.loadtxt(DATA / logs.ASU_LOGS[name], delimiter=",")
     assert len(log.fresh) == n_rows and np.mean(~log.fresh) == pytest.approx(share, abs=0.005)
+    quaternion = raw[:, 17:].reshape(-1, 3, 7)[..., [6, 3, 4, 5]]
     for body, n_jumps in enumerate(jumps):
-        turned = checks.turned_rows(log.quaternion[:, body])
+        turned = checks.turned_rows(quaternion[:, body])
         assert np.count_nonzero(np.diff(turned.astype(int))) == n_jumps and np.mean(turned) < 0.5
-        kept, _ = checks.same_sign(log.quaternion[~turned, body])
-        assert ((kept[1:] * kept[:-1]).sum(axis=1) > 0.9).all()
-    np.testing.assert_allclose(log.pressure_kpa / PSI, raw[:, [4, 5, 6, 10, 11, 12]], rtol=1e-9)
+        assert_one_motion(quaternion[~turned, body], 0.9)
     # The wires of section 1 move as the distance of base and middle.
-    slope, _ = np.polyfit(log.wire_m[log.fresh, :2].mean(axis=1), log.section_m[log.fresh], 1)
+    slope, _ = np.polyfit(log.wire_m[log.fresh], log.section_m[log.fresh], 1)
     assert 0.8 < slope < 1.1 and (np.diff(log.time_s) > 0.0).all()
 
 
@@ -60,36 +69,22 @@ def test_real_asu(name, n_rows, share, jumps):
 def test_real_motion_has_next_to_no_outliers():
     """The detector of `read_log`, on step responses and on fast swings: positions, pressures, draw-wires."""
     for name in logs.ASU_LOGS.values():
-        log = read_asu(DATA / name)
-        columns = [*log.position_m[log.fresh].reshape(-1, 9).T, *log.wire_m.T]
+        raw, fresh = np.loadtxt(DATA / name, delimiter=","), read_asu(DATA / name).fresh
+        positions_m = raw[fresh, 17:].reshape(-1, 3, 7)[..., :3].reshape(-1, 9)
+        columns = [*positions_m.T, *(logs.WIRE_M_PER_V * raw[:, 13:17]).T]
         assert sum(np.count_nonzero(checks.outlier_rows(column, 2e-3)) for column in columns) <= 1
-        assert sum(np.count_nonzero(checks.outlier_rows(column, 10.0)) for column in log.pressure_kpa.T) == 0
+        pressure_kpa = PSI_KPA * raw[:, [4, 5, 6, 10, 11, 12]]
+        assert sum(np.count_nonzero(checks.outlier_rows(column, 10.0)) for column in pressure_kpa.T) == 0
     for number in (1, 11):
         log = read_trunk(DATA / logs.TRUNK_LOG.format(number))
-        tip = log.position_m[log.fresh, 2]
-        assert not any(checks.outlier_rows(tip[:, axis], 2e-3).any() for axis in range(3))
+        tip_m = log.tip_m[log.fresh]
+        assert not any(checks.outlier_rows(tip_m[:, axis], 2e-3).any() for axis in range(3))
 
 
 @real
 @pytest.mark.parametrize(("name", "wire_mm"), [("apr5", 0.62), ("apr4", 0.25)])
 def test_real_draw_wires(name, wire_mm):
-    assert logs.wires(DATA, name)["fresh rows at rest"] <= wire_mm
-
-
-def test_files_that_are_not_such_logs(tmp_path):
-    names = [f"{axis}{disk}" for disk in (1, 2, 3) for axis in "xyz"] + [f"phi{k}" for k in range(1, 7)]
-    trunk, asu = tmp_path / "trunk.csv", tmp_path / "asu.txt"
-    np.savetxt(trunk, np.ones((4, 14)), "%g", ",", header=",".join(names[:4] + names[5:]), comments="")
-    with pytest.raises(LogError, match="trunk.csv: line 1: y2: got no such columns, expected"):
-        read_trunk(trunk)
-    table = np.ones((9, 38))
-    table[7, 4] = np.nan
-    np.savetxt(asu, table, "%g", ",")
-    with pytest.raises(LogError, match="asu.txt: line 8: measured0: got nan, expected a finite number"):
-        read_asu(asu)
-    np.savetxt(asu, table[:, :26], "%g", ",")
-    with pytest.raises(LogError, match="asu.txt: line 1: got 26 cells, expected 38"):
-        read_asu(asu)
+    assert logs.wires_error(DATA, name) <= wire_mm
 
 
 @pytest.mark.slow

@@ -1,33 +1,27 @@
-"""The paper's recipe as printed: its cases, its demonstrations and its figures, on made-up courses."""
+"""The paper's recipe as printed: its cases and its figures on made-up courses; a tiny run."""
 
 import json
 
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.accuracy import printed
-from benchmarks.accuracy.printed import CASES, PRESETS, curves, loss_rows, over_seeds, run_name
+from benchmarks.accuracy.printed import CASES, PRESETS, curves, final_figures, run_name
 from benchmarks.harness import common
 from train.config import override
 from train.presets import IMITATION_PRESETS
 
 
-def course(success, median_mm=5.0, losses=(4.0, 4.0, 2.0, 2.0, 1.0, 1.0)):
-    """Six epochs, the first without updates; the evaluations after the third and the last tell `success`."""
-    rows = []
-    for epoch, loss in enumerate(losses, 1):
-        row = {"epoch": epoch, "env_steps": 100 * epoch, "updates": 10 * (epoch - 1)}
-        row |= dict.fromkeys(printed.LOSSES, loss)
-        if epoch in (3, 6):
-            row |= {"evaluation/success_share": success[epoch // 6], "evaluation/median_mm": median_mm}
-        rows.append(row)
+def course(success, median_mm):
+    """Return six epochs; those after the third and the last are evaluated."""
+    rows = [{"env_steps": 100 * epoch, "updates": 10 * epoch} for epoch in range(1, 7)]
+    for row, share in zip(rows[2::3], success, strict=True):
+        row |= {"evaluation/success_share": share, "evaluation/median_mm": median_mm}
     return rows
 
 
 def test_every_case_is_a_preset_of_the_paper_with_other_settings():
-    assert not any("," in name for name in CASES)  # --cases takes NAME,NAME,...
     names = [run_name(name, 0) for name in CASES]
-    assert len(set(names)) == len(names) and not any(set(" ,'") & set(name) for name in names)
+    assert len(set(names)) == len(names)
     configs = [override(IMITATION_PRESETS[PRESETS[c.task]], c.settings) for c in CASES.values()]
     assert len(set(configs)) == len(configs)
 
@@ -47,30 +41,14 @@ def test_the_paper_s_recipe_is_as_printed():
 
 
 def test_figures_are_over_the_seeds_of_a_case():
-    runs = [course((0.0, 0.5)), course((0.25, 1.0), median_mm=3.0)]
-    row = over_seeds("circle-learned", runs)
-    assert row == {
-        "case": "circle-learned",
-        "seeds": 2,
-        "env_steps": 600,
-        "updates": 50,
-        "success_share": "0.75 (0.5 to 1)",
-        "median_mm": "4 (3 to 5)",
-    }
-    assert curves({"circle-learned": runs}) == {
-        "circle-learned": {"env_steps": [300, 600], "success_percent": [[0.0, 50.0], [25.0, 100.0]]}
-    }
-
-
-def test_losses_begin_with_the_first_update():
-    first, *_ = loss_rows("circle-learned", course((0.0, 1.0), losses=(9.0, 4.0, 2.0, 2.0, 1.0, 1.5)))
-    assert first == {
-        "case": "circle-learned",
-        "loss": "critics' loss",
-        "first tenth": 4.0,
-        "last tenth": 1.5,
-        "fluctuation": 0.75,
-    }
+    metrics = {"circle-learned": [course((0.0, 0.5), 5.0), course((0.25, 1.0), 3.0)]}
+    steps = {"case": "circle-learned", "env_steps": 600, "updates": 60, "runs": 2}
+    spreads = {"success_share": "0.75 ± 0.25 (0.5 to 1)", "median_mm": "4 ± 1 (3 to 5)"}
+    assert final_figures(metrics) == [steps | spreads]
+    percent = [[0.0, 50.0], [25.0, 100.0]]
+    assert curves(metrics) == [
+        {"case": "circle-learned", "env_steps": [300, 600], "success_percent": percent}
+    ]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Tables of figures, and targets."""
+"""Spreads over runs, tables of figures, and targets."""
 
 import io
 import json
@@ -8,29 +8,26 @@ from rich.console import Console
 
 from benchmarks import __main__ as benchmarks
 from benchmarks.harness import common
-from benchmarks.harness.common import show, target
+from benchmarks.harness.common import over_runs, show, spread, target
 
 
-def shown(figures, title=""):
-    console = Console(file=io.StringIO(), width=200)
-    show(figures, title, console)
-    return console.file.getvalue()
-
-
-def cells(text):
-    return [
-        [cell.strip() for cell in line.strip("│").split("│")] for line in text.splitlines() if "│" in line
+def test_spreads_are_those_of_the_runs_of_a_group():
+    rows = [{"way": w, "mm": mm, "n": 4} for w, mm in (("a", 1.0), ("b", 5.0), ("a", 2.0))]
+    assert over_runs(rows, ("way",), ("mm", "n", "absent")) == [
+        {"way": "a", "runs": 2, "mm": "1.5 ± 0.5 (1 to 2)", "n": "4"},
+        {"way": "b", "runs": 1, "mm": "5", "n": "4"},
     ]
+    assert spread([1.0, float("nan")]) == "nan ± nan (nan to nan)"  # a missed goal is not hidden
 
 
-def test_a_list_of_rows_is_a_table_with_a_column_for_every_name_in_any_row():
-    text = shown(
-        {"rates": [{"arms": 1024, "env_steps_per_s": 0.5}, {"arms": 1, "skipped": "no [cuda] here"}]}
-    )
-    assert ["rates"] in [line.split(",") for line in text.splitlines()]
-    assert ["1,024", "0.5", ""] in cells(text)
-    assert f"│ {'0.5':>15} │" in text  # numbers to the right, gaps or not
-    assert ["1", "", "no [cuda] here"] in cells(text)
+def test_rows_become_a_table_with_a_column_for_every_name_in_any_row():
+    console = Console(file=io.StringIO(), width=200)
+    rates = [{"arms": 1024, "env_steps_per_s": 0.5}, {"arms": 1, "skipped": "no [cuda] here"}]
+    show({"machine": "Abacus", "inner": {"rates": rates}}, "speed", console)
+    text = console.file.getvalue()
+    assert text.splitlines()[0] == "speed, machine: Abacus" and "\nspeed, inner, rates\n" in text
+    cells = [[cell.strip() for cell in line.strip("│").split("│")] for line in text.splitlines()]
+    assert ["1,024", "0.5", ""] in cells and ["1", "", "no [cuda] here"] in cells
 
 
 @pytest.mark.parametrize(("met", "status"), [(True, 0), (None, 0), (False, 1)])

@@ -7,20 +7,16 @@ from unittest.mock import Mock
 import pytest
 
 from benchmarks.harness import peers
-from benchmarks.harness.peers import MARKER, PINS, SHARED, PeerError, peer_packages, peer_python
+from benchmarks.harness.peers import MARKER, PINS, SHARED, peer_packages, peer_python
+from mjx_softarm._support.errors import InputError
 
 
 @pytest.fixture
-def made(monkeypatch):
-    """A list of the packages of each environment that was made, in place of making it."""
-    made = []
-
-    def make(home, python, packages):
-        home.mkdir(exist_ok=True)
-        made.append(packages)
-
-    monkeypatch.setattr(peers, "_make", make)
-    return made
+def install(monkeypatch):
+    """The call of pip, in place of making an environment."""
+    monkeypatch.setattr(peers.venv, "create", lambda home, **_: home.mkdir(exist_ok=True))
+    monkeypatch.setattr(peers.subprocess, "run", Mock())
+    return peers.subprocess.run
 
 
 @pytest.mark.parametrize("name", PINS)
@@ -30,20 +26,18 @@ def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here
     assert requirements == pins | {shared: metadata.version(shared) for shared in SHARED}
 
 
-def test_an_environment_is_made_once_and_anew_for_a_changed_pin_or_python(made, monkeypatch, tmp_path):
-    first = peer_python("sbx", tmp_path)
-    assert peer_python("sbx", tmp_path) == first == tmp_path / ".venv-sbx/bin/python"
+def test_an_environment_is_made_once_and_anew_for_a_changed_pin_or_python(install, monkeypatch, tmp_path):
+    assert peer_python("sbx", tmp_path) == peer_python("sbx", tmp_path) == tmp_path / ".venv-sbx/bin/python"
+    assert install.call_count == 1 and "sbx-rl==0.28.0" in install.call_args[0][0]
     monkeypatch.setitem(PINS, "sbx", ("sbx-rl==0.0.1",))
     peer_python("sbx", tmp_path)
-    marker = tmp_path / ".venv-sbx" / MARKER
-    marker.write_text("python 3.1\n", "utf-8")
+    (tmp_path / ".venv-sbx" / MARKER).write_text("python 3.1\n", "utf-8")
     peer_python("sbx", tmp_path)
-    assert [packages[0] for packages in made[1:]] == ["sbx-rl==0.0.1"] * 2 and len(made) == 3
+    assert install.call_count == 3
 
 
-def test_why_an_environment_cannot_be_made_is_told_in_one_line(monkeypatch, tmp_path):
-    failed = subprocess.CalledProcessError(1, ["pip"], stderr="a\nERROR: No matching distribution\n")
-    monkeypatch.setattr(peers, "_make", Mock(side_effect=failed))
-    with pytest.raises(PeerError, match=r"^sbx: got ERROR: No matching distribution, expected .*\.venv-sbx$"):
+def test_an_environment_that_cannot_be_made_is_an_error_of_one_line(install, tmp_path):
+    install.side_effect = subprocess.CalledProcessError(1, ["pip"], stderr="a\nERROR: No distribution\n")
+    with pytest.raises(InputError, match=r"^sbx: got ERROR: No distribution, expected .*\.venv-sbx$"):
         peer_python("sbx", tmp_path)
     assert not (tmp_path / ".venv-sbx" / MARKER).exists()

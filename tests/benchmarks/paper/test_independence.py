@@ -1,6 +1,5 @@
-"""Arms whose actions are pressures, and what the comparison of claims makes of results."""
+"""Arms whose actions are pressures, and payloads that policies observe."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -8,9 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.paper import independence
-from benchmarks.paper.independence import POLICIES, SOLVER, PressureEnv, follow, means
-from benchmarks.paper.trials import SMOKE
+from benchmarks.paper.independence import POLICIES, PressureEnv, follow
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp import rewards
@@ -83,20 +80,3 @@ def test_a_payload_is_carried_and_observed_from_the_first_action_on(quick_compil
             reached.pressure_kpa, low + 0.5 * (load_kg + 1.0) * (high - low), atol=0.02
         )
     assert not np.allclose(light.pose, heavy.pose, atol=1.0)
-
-
-def test_a_seed_that_is_measured_is_not_measured_again(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        independence,
-        "descent",
-        lambda settings: lambda seed: asked.append(seed) or [{"load_g": 0, "mm": 1.0}],
-    )
-    for seeds in ((0,), (0, 1)):
-        independence.measure(tmp_path, dataclasses.replace(SMOKE, seeds=seeds), SOLVER)
-    assert asked == [0, 1]
-
-
-def test_figures_are_means_over_the_seeds_of_a_group():
-    rows = [{"way": w, "seed": s, "mm": mm} for w, s, mm in (("a", 0, 1.0), ("b", 0, 5.0), ("a", 1, 2.0))]
-    assert means(rows, ("way",)) == [{"way": "a", "mm": "1.50 ± 0.50"}, {"way": "b", "mm": "5.00 ± 0.00"}]

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.harness.stages import load_arrays, save_arrays
-from benchmarks.paper import jobs, pictures, report
+from benchmarks.harness import stages as harness
+from benchmarks.paper import experiments, pictures, report
 from benchmarks.paper.experiments import stages
-from benchmarks.paper.trial import WAY, TrialOutcome
 from benchmarks.paper.trials import (
     KINDS,
     PIPE_KINDS,
@@ -23,7 +22,6 @@ from benchmarks.paper.trials import (
 )
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli
-from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import save_policy
@@ -45,7 +43,8 @@ def test_every_trial_has_a_result_of_its_own_after_the_files_that_it_needs():
         assert len(set(listed)) == len(listed) == len({trial.result for trial in listed})
         for trial in listed:
             run = run_path(trial.kind, trial.twin, trial.seed)
-            needed = [f"{run}/policy.npz"] + ["nominal-seed0/policy.npz"] * (trial.kind == "without")
+            needed = [f"{run}/policy.npz"]
+            needed += [f"{run_path('specified', None, 0)}/policy.npz"] * (trial.kind == "without")
             assert all(group_of[path] < group_of[trial.result] for path in needed)
             if trial.kind != "specified":
                 assert group_of[f"twin{trial.twin}/calibration"] < group_of[f"{run}/evaluation.json"]
@@ -62,7 +61,8 @@ def test_every_trial_has_a_result_of_its_own_after_the_files_that_it_needs():
 def ask(monkeypatch):
     """A function: a stage's job and its arguments -> the options of the `train` command that it ran."""
     calls = []
-    monkeypatch.setattr(jobs, "command", lambda log, *words, makes: calls.append([*map(str, words)]))
+    for module in (experiments, harness):
+        monkeypatch.setattr(module, "command", lambda log, *words, makes: calls.append([*map(str, words)]))
 
     def run(job, *arguments):
         calls.clear()
@@ -74,29 +74,28 @@ def ask(monkeypatch):
     return run
 
 
-def test_trainings_have_the_arm_and_the_preset_of_their_kind_and_resume(tmp_path, ask):
+def test_trainings_have_the_arm_and_the_preset_of_their_kind(tmp_path, ask):
     calibration = tmp_path / "twin1/calibration"
     for kind, preset in (("with", "analytic"), ("payload", "payload"), ("motion", "motion")):
-        options = ask(jobs.train, tmp_path, Settings(), kind, 1, 2)
+        options = ask(experiments.reach, tmp_path, Settings(), kind, 1, 2)
         assert (options.preset, options.config.seed, options.calibration) == (preset, 2, calibration)
-    options = ask(jobs.train, tmp_path, Settings(), "chambers", 1, 2)
+    options = ask(experiments.reach, tmp_path, Settings(), "chambers", 1, 2)
     assert (options.spec, options.calibration) == (calibration / ARM_FILE, None)
     assert options.config.learner.total_env_steps == 524_288
-    assert ask(jobs.train, tmp_path, SMOKE, "chambers", 1, 2).config.learner.total_env_steps == 512
-    run = tmp_path / run_path("specified", None, 2)
-    assert ask(jobs.train, tmp_path, Settings(), "specified", None, 2).out == run
-    run.mkdir()
-    (run / "config.json").touch()
-    assert ask(jobs.train, tmp_path, Settings(), "specified", None, 2).resume == run
-    runs = (run.name, run_path("specified", None, 3))
-    (run / "policy.npz").touch()
-    exported = ask(jobs.export, tmp_path, Settings(), None, runs).keywords["folders"]
-    assert exported == (tmp_path / runs[1],)
+    tiny = ask(experiments.reach, tmp_path, SMOKE, "chambers", 1, 2)
+    assert tiny.config.learner.total_env_steps == 512
+    nominal = [tmp_path / run_path("specified", None, seed) for seed in (2, 3)]
+    assert ask(experiments.reach, tmp_path, Settings(), "specified", None, 2).out == nominal[0]
+    nominal[0].mkdir()
+    (nominal[0] / "policy.npz").touch()
+    policies = tuple(f"{run.name}/policy.npz" for run in nominal)
+    exported = ask(experiments.export, tmp_path, Settings(), None, policies).keywords["folders"]
+    assert exported == (nominal[1],)
 
 
 @pytest.mark.parametrize("kind", PIPE_KINDS)
 def test_imitation_has_the_reward_and_the_pipe_of_its_kind(tmp_path, ask, kind):
-    options = ask(jobs.imitate, tmp_path, SMOKE, kind, 0, 0)
+    options = ask(experiments.imitate, tmp_path, SMOKE, kind, 0, 0)
     learner, env = options.config.learner, options.config.env
     assert learner.n_epochs == 2
     assert env.pipe_diameter_mm == int(KINDS[kind].task.removeprefix("pipe"))
@@ -105,25 +104,15 @@ def test_imitation_has_the_reward_and_the_pipe_of_its_kind(tmp_path, ask, kind):
     assert (learner.learned_weight > 0) == (not kind.endswith("hand-made"))
 
 
-def test_a_run_that_lacks_its_checkpoint_or_config_starts_anew(tmp_path, ask):
-    run = tmp_path / run_path("pipe", 1, 2)
-    for made, resumes in ((("config.json",), False), (("checkpoints/0",), False)):
-        for name in made:
-            (run / name).mkdir(parents=True)
-        assert (ask(jobs.imitate, tmp_path, TINY, "pipe", 1, 2).resume == run) is resumes
-        assert not run.exists()
-    (run / "checkpoints/0").mkdir(parents=True)
-    (run / "config.json").touch()
-    assert ask(jobs.imitate, tmp_path, TINY, "pipe", 1, 2).resume == run
-
-
 def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp_path, make_arm_model):
     calibrated = SPEC.replace(sensor={"beta": 0.9, "delta_m": 0.004}, springs={"length_min_m": 0.1})
-    for twin, spec in ((None, SPEC), (0, calibrated)):
-        run = tmp_path / run_path("with", twin, 0)
+    for kind, spec in (("specified", SPEC), ("with", calibrated)):
+        run = tmp_path / run_path(kind, 0, 0)
         run.mkdir()
         save_policy(run / "policy.npz", make_policy(make_arm_model, spec))
-    controllers = {kind: jobs.controller_of(tmp_path, Trial(kind, 0, 0)) for kind in ("without", "specified")}
+    controllers = {
+        kind: experiments.controller_of(tmp_path, Trial(kind, 0, 0)) for kind in ("without", "specified")
+    }
     beta = {kind: controller.policy.sensor.beta for kind, controller in controllers.items()}
     assert np.array_equal(beta["without"], calibrated.spring_sensor.beta)
     assert np.array_equal(beta["specified"], SPEC.spring_sensor.beta)
@@ -139,38 +128,39 @@ def test_a_policy_goes_to_a_point_on_a_rod(tmp_path, make_arm_model, monkeypatch
     (tmp_path / run_path("with", 0, 0)).mkdir()
     spec = SPEC.replace(control={"ki_kpa_per_ms": 1000.0})  # slow enough for the rod's regulators
     save_policy(tmp_path / run_path("with", 0, 0) / "policy.npz", make_policy(make_arm_model, spec))
-    jobs.try_out(tmp_path, settings, trial)
-    outcome = load_arrays(TrialOutcome, tmp_path / trial.result)
-    assert np.isfinite(outcome.error).all() and not outcome.operation.any()
-    assert np.linalg.norm(outcome.error[0, :3]) > 10.0 and not outcome.wall_n.any()
+    experiments.try_out(tmp_path, settings, trial)
+    row = json.loads((tmp_path / trial.result).read_text("utf-8"))
+    assert row["measured"] == 1 and row["translation_mm"] > 10.0
+    assert row["operations"] == row["wall_max_n"] == 0
     assert (tmp_path / trial.log).exists()  # it is drawn over time
 
 
-def made_up(trial, mm=1.0, saturated=0, reported=0, fails=0, pressed=0.0, missed=0, off_g=0.0, tick_s=0.1):
-    """An outcome with one error at every goal of four, all operations done but for some."""
-    names = ["pick a", "place b", "pick c", "place d"] if trial.objects else [""] * 4
-    error = np.zeros((4, 6))
-    error[:, 0], error[:missed] = mm, np.nan
-    mask = np.zeros((4, N), bool)
-    mask[:saturated, 2] = True
-    return TrialOutcome(
-        goal=circle_poses(SPEC, 4).astype(float),
-        name=np.array(names),
-        error=error,
-        believed=np.full((4, 6), 0.5),
-        saturated=mask,
-        success=np.array([bool(trial.objects) and k >= fails for k in range(4)]),
-        arrival_s=np.arange(1.0, 5.0),
-        load_estimate_g=np.full(4, trial.load_g + off_g),
-        events=np.array([reported if fault is Fault.SATURATED else 0 for fault in Fault]),
-        time_s=(0.04 if trial.moves else tick_s) * np.arange(101),
-        wall_n=np.where(np.arange(101) < 101 * pressed, 2.0, 0.0),
-        way=np.full(len(WAY), mm if trial.lap_s else np.nan),
-    )
+def made_up(trial, mm=1.0, saturated=0, reported=0, fails=0, calm=100.0, missed=0, off_g=0.0, seconds=10.0):
+    """Return figures with one error at every goal of four, all operations done but for some."""
+    errors = dict.fromkeys(("translation_mm", "max_mm", "x_mm", "way_mm"), mm if not missed else np.nan)
+    operations = 4 * bool(trial.objects)
+    return {
+        **trial._asdict(),
+        "variant": trial.variant,
+        "points": 4,
+        "measured": 4 - missed,
+        **dict.fromkeys(("y_mm", "z_mm", "rmse_mm", "yaw_deg", "pitch_deg", "roll_deg"), 0.0),
+        **errors,
+        "saturated_points": saturated,
+        "saturation_events": reported,
+        "load_off_g": off_g,
+        "operations": operations,
+        "done": operations - fails,
+        "calm_percent": calm,
+        "wall_max_n": 0.0,
+        "seconds": 0.4 * seconds if trial.moves else seconds,
+        "events": {},
+        "believed_mm": 0.5,
+    }
 
 
 def good(experiment):
-    """Outcomes that meet every target."""
+    """Return figures that meet every target."""
     outcomes = {}
     for trial in trials(experiment, TINY):
         hit = trial.kind == "gradient" or trial.load_g == 1000
@@ -180,66 +170,72 @@ def good(experiment):
 
 
 def unmet(experiment, changes):
-    """Beginnings of the targets that are missed with some changed outcomes."""
-    outcomes = good(experiment) | {trial: made_up(trial, **change) for trial, change in changes.items()}
-    table = report.trial_rows(outcomes)
-    rows = report._open(table, "twin") if experiment == "open" else report._confined(table)
-    return [row["target"] for row in rows if row["verdict"] != "met"]
+    """Return the targets that are missed with some changed figures."""
+    rows = good(experiment) | {trial: made_up(trial, **change) for trial, change in changes.items()}
+    targets = report.figures_of(experiment, TINY, list(rows.values()))["targets"]
+    return [row["target"] for row in targets if row["verdict"] != "met"]
 
 
 FIRST, PIPE = Trial("with", 0, 0), Trial("pipe", 0, 0, "as shown")
 HEAVY, LAP, OBSERVED = FIRST._replace(load_g=1000), FIRST._replace(lap_s=20.0), Trial("payload", 0, 0)
-XYZ = ["300 mm pipe: mean absolute error in X"]
+S2R, GRADIENT, PIPE_SHOWN = "with S2R, 0 g: ", "gradient descent, 0 g: ", "learned reward, as shown: "
 
 
 @pytest.mark.parametrize(
     ("experiment", "changes", "missed"),
     [
         ("open", {}, []),
-        ("open", {FIRST: {"mm": 7.0}}, ["with S2R, mean translation", "translation with calibrated"]),
-        ("open", {FIRST: {"saturated": 1}}, ["with S2R, unloaded: no saturated"]),
-        ("open", {LAP: {"mm": 4.0}}, ["with S2R, once around in 20 s"]),
-        ("open", {FIRST._replace(load_g=500): {"mm": 4.5}}, ["500 g, mean translation"]),
-        ("open", {HEAVY: {"mm": 12.1, "saturated": 1, "reported": 1}}, ["1 kg, mean", "1 kg, largest"]),
-        ("open", {HEAVY: {"saturated": 1}}, ["1 kg, saturation detected"]),  # and not reported
-        ("open", {HEAVY: {"off_g": 800.0, "reported": 1}}, ["payload, estimated"]),
+        ("open", {FIRST: {"mm": 7.0}}, [f"{S2R}mean of translation", "calibrated springs, 0 g: mean of"]),
+        ("open", {FIRST: {"saturated": 1}}, [f"{S2R}sum of saturated_points"]),
+        ("open", {LAP: {"mm": 4.0}}, ["with S2R, 0 g in 20 s: mean of way_mm"]),
+        ("open", {FIRST._replace(load_g=500): {"mm": 4.5}}, ["with S2R, 500 g: mean of translation"]),
+        (
+            "open",
+            {HEAVY: {"mm": 12.1, "saturated": 1, "reported": 1}},
+            ["with S2R, 1000 g: mean of translation", "with S2R, 1000 g: max of max_mm"],
+        ),
+        ("open", {HEAVY: {"saturated": 1}}, ["with S2R, 1000 g: sum of unreported"]),
+        ("open", {HEAVY: {"off_g": 800.0, "reported": 1}}, ["with S2R: mean of load_off_g"]),
         (
             "open",
             {OBSERVED._replace(load_g=1000): {"mm": 12.1}},
-            ["1 kg observed, mean", "1 kg observed, largest"],
+            ["with S2R, payload, 1000 g: mean of trans", "with S2R, payload, 1000 g: max of max_mm"],
         ),
-        ("open", {t: {} for t in trials("open", TINY) if t.kind == "gradient"}, ["gradient descent"]),
-        ("open", {Trial("motion", 1, 0): {"missed": 1}}, ["every point of every run"]),
+        ("open", {t: {} for t in trials("open", TINY) if t.kind == "gradient"}, [f"{GRADIENT}sum of satur"]),
+        ("open", {Trial("motion", 1, 0): {"missed": 1}}, ["all kinds: sum of missed"]),
+        ("open", {LAP: {"missed": 1}}, ["with S2R, 0 g in 20 s: mean of way", "all kinds: sum of missed"]),
         ("confined", {}, []),
-        ("confined", {PIPE: {"mm": 10.0}}, XYZ),
-        ("confined", {PIPE: {"fails": 1}}, ["300 mm pipe: all four operations"]),
-        ("confined", {Trial("narrow", 1, 0, "as shown"): {"fails": 2}}, ["250 mm pipe: both tasks"]),
-        ("confined", {PIPE._replace(objects="exchanged"): {"pressed": 0.05}}, ["300 mm pipe, as shown and"]),
-        ("confined", {PIPE._replace(moves=True): {"pressed": 0.05}}, ["300 mm pipe, in motion: wall"]),
-        ("confined", {PIPE: {"tick_s": 0.02}}, ["300 mm pipe, in motion: time"]),  # with stops
+        ("confined", {PIPE: {"mm": 10.0}}, [f"{PIPE_SHOWN}mean of x_mm"]),
+        ("confined", {PIPE: {"fails": 1}}, ["learned reward, as shown, exchanged: both_orders of all_done"]),
+        (
+            "confined",
+            {Trial("narrow", 1, 0, "as shown"): {"fails": 2}},
+            ["hand-made, and learned in the wide pipe, as shown: mean of all_done"],
+        ),
+        (
+            "confined",
+            {PIPE._replace(objects="exchanged"): {"calm": 95.0}},
+            ["learned reward, as shown, exchanged: min of calm"],
+        ),
+        (
+            "confined",
+            {PIPE._replace(moves=True): {"calm": 95.0}},
+            ["learned reward, as shown in motion: min"],
+        ),
+        ("confined", {PIPE: {"seconds": 2.0}}, ["learned reward, as shown in motion: mean of seconds over"]),
         ("confined", {Trial("narrowest", 0, 0, "as shown"): {"mm": 99.0, "fails": 4}}, []),  # no target
     ],
 )
 def test_targets_that_are_missed_are_named(experiment, changes, missed):
     texts = unmet(experiment, changes)
-    assert len(texts) == len(missed)
-    assert all(text.startswith(start) for text, start in zip(texts, missed, strict=True))
+    assert len(texts) == len(missed), texts
+    assert all(text.startswith(start) for text, start in zip(texts, missed, strict=True)), texts
 
 
 def test_a_figure_that_was_not_measured_is_not_met():
-    for rows in (report._open([], "twin"), report._confined([])):
+    for experiment in ("open", "confined"):
+        rows = report.figures_of(experiment, TINY, [])["targets"]
         assert {(row["measured"], row["verdict"]) for row in rows} == {("not measured", "NOT MET")}
-
-
-def test_spreads_are_over_runs_and_a_missed_goal_is_not_hidden():
-    outcomes = good("open") | {FIRST: made_up(FIRST, 3.0, missed=1)}
-    spreads = {(item["kind"], item["variant"]): item for item in report.spreads(report.trial_rows(outcomes))}
-    unloaded = spreads["with", "0 g"]
-    assert (unloaded["runs"], unloaded["incomplete_runs"]) == (2, 1)
-    assert unloaded["translation_mm"] == pytest.approx({"mean": 2.0, "std": 1.0, "min": 1.0, "max": 3.0})
-    assert unloaded["paper"]["translation_mm"] == 11.59
-    assert spreads["with", "1000 g"]["paper"] == {"max_mm": 23.76} and not spreads["gradient", "0 g"]["paper"]
-    assert "with", "0 g in 20 s" in spreads
 
 
 @pytest.fixture
@@ -268,19 +264,16 @@ def test_traces_have_a_panel_for_each_quantity_and_load(log):
     assert len(figure.axes[4].lines) == N + 2  # with the limits
 
 
-def test_results_are_written_whole_without_what_is_no_number(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "_draw", lambda *_: None)
-    for twin in TINY.twins:
-        home = tmp_path / f"twin{twin}/calibration"
-        home.mkdir(parents=True)
-        (home / "report.json").write_text('{"parts": {"Springs": {"warnings": ["off by much"]}}}')
-    for trial, outcome in (good("confined") | {PIPE: made_up(PIPE, missed=4)}).items():
-        save_arrays(tmp_path / trial.result, outcome)
+def test_results_are_written_with_spreads_and_without_what_is_no_number(tmp_path):
+    (tmp_path / "trials").mkdir()
+    for trial, figures in (good("confined") | {PIPE: made_up(PIPE, missed=4)}).items():
+        (tmp_path / trial.result).write_text(json.dumps({**figures, "at_stops": {}}))
     report.write_report("confined", tmp_path, tmp_path / "made", TINY)
     figures = json.loads((tmp_path / "made/paper-confined.json").read_text("utf-8"))["figures"]
-    assert figures["targets"][0]["measured"] == "nan mm, 4 points missed in 1 of 2 runs"
+    assert figures["targets"][0]["measured"] == "nan, 4 points missed"
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 1
-    assert figures["calibrations"]["twin 1"] == {"Springs": ["off by much"]}
+    spreads = {(row["kind"], row["variant"]): row for row in figures["spreads"]}
+    assert spreads["pipe", "exchanged"]["runs"] == 2 and spreads["pipe", "exchanged"]["done"] == "4"
 
 
 @pytest.mark.slow
@@ -288,4 +281,4 @@ def test_results_are_written_whole_without_what_is_no_number(tmp_path, monkeypat
 def test_smoke(tmp_path, experiment):
     assert main(["paper", "--smoke", "--only", experiment, "--out", str(tmp_path)]) == 0
     made = json.loads((tmp_path / f"paper-{experiment}.json").read_text("utf-8"))
-    assert made["figures"]["targets" if experiment != "independence" else "under loads"]
+    assert made["figures"]["spreads"]

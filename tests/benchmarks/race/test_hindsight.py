@@ -78,16 +78,18 @@ def played():
 def test_goals_of_their_own_would_have_given_what_the_environment_gave(played, monkeypatch):
     buffer, where = played.buffer, played.where
     monkeypatch.setattr(buffer, "_sample_goals", lambda *where: buffer.observations["desired_goal"][where])
-    told, own = buffer._get_virtual_samples(*where), buffer._get_real_samples(*where)
-    for name in told.observations:
-        np.testing.assert_allclose(told.observations[name], own.observations[name], atol=1e-5)
-        np.testing.assert_allclose(told.next_observations[name], own.next_observations[name], atol=1e-5)
-    np.testing.assert_allclose(told.rewards, own.rewards, atol=1e-4)
-    np.testing.assert_array_equal(told.dones, own.dones)
-    np.testing.assert_array_equal(told.actions, own.actions)
-    np.testing.assert_array_equal(np.isclose(own.rewards[:, 0], -10.0), played.saturated[where])
+    exchanged, stored = buffer._get_virtual_samples(*where), buffer._get_real_samples(*where)
+    for name in exchanged.observations:
+        np.testing.assert_allclose(exchanged.observations[name], stored.observations[name], atol=1e-5)
+        np.testing.assert_allclose(
+            exchanged.next_observations[name], stored.next_observations[name], atol=1e-5
+        )
+    np.testing.assert_allclose(exchanged.rewards, stored.rewards, atol=1e-4)
+    np.testing.assert_array_equal(exchanged.dones, stored.dones)
+    np.testing.assert_array_equal(exchanged.actions, stored.actions)
+    np.testing.assert_array_equal(np.isclose(stored.rewards[:, 0], -10.0), played.saturated[where])
     assert 0.1 < played.saturated[where].mean() < 0.9
-    assert 0.1 < own.dones.numpy().mean() < 0.9
+    assert 0.1 < stored.dones.numpy().mean() < 0.9
 
 
 def test_goals_near_the_pose_reached_are_as_many_and_as_far_as_asked_for(played, monkeypatch):

@@ -1,32 +1,15 @@
-"""The benchmark of a GPU: rows of programs that take turns, a training's times, sizes that fit."""
+"""The benchmark of a GPU: a training's times, sizes that fit, a row for each point."""
 
-from __future__ import annotations
-
+import json
 from typing import Any
 
 import pytest
 
-from benchmarks.speed import gpu
+from benchmarks.__main__ import main
+from benchmarks.harness import common
+from benchmarks.speed import gpu, throughput
 from train.config import override
 from train.presets import PRESETS
-
-
-def test_each_size_has_a_row_and_a_program_that_failed_says_why(monkeypatch):
-    monkeypatch.setattr(gpu, "STEPS", {("mjx", "dynamic"): (8, 64)})
-    monkeypatch.setattr(gpu, "LEARNERS", {"quick": ((8, 4),)})
-
-    def take_turns(workers, n_rounds, n_starting):
-        bad, *good = workers
-        rates = [{"env_steps_per_s": 1000.0 * k} for k in range(1, n_rounds + 1)]
-        return {worker.name: rates for worker in good}, {bad.name: "out of memory"}
-
-    monkeypatch.setattr(gpu, "take_turns", take_turns)
-    found = gpu.speed()
-    assert found["env_steps"] == [
-        {"engine": "mjx", "mode": "dynamic", "arms": 8, "failed": "out of memory"},
-        {"engine": "mjx", "mode": "dynamic", "arms": 64, "env_steps_per_s": 1500},
-    ]
-    assert found["learning"] == [{"preset": "quick", "arms": 8, "batch": 4, "env_steps_per_s": 1500}]
 
 
 def test_the_clock_of_a_training_runs_in_its_epochs():
@@ -46,3 +29,17 @@ def test_the_sizes_of_a_training_fit_each_other(preset):
     assert learner.n_env_steps(learner.n_epochs) == learner.total_env_steps
     if preset == "motion":
         assert learner.n_updates_per_vector_step == 128
+
+
+@pytest.mark.slow
+def test_smoke(tmp_path, monkeypatch):
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    for module in (gpu, throughput):  # JAX has been used: no more devices
+        monkeypatch.setattr(module, "mesh_of_cores", lambda n: None)
+    monkeypatch.setattr(gpu, "STEPS", {("chain", "quasistatic"): (8,)})
+    tiny = {"learner.n-arms": 16, "learner.total-env-steps": 1024, "env.n-poses": 256}
+    monkeypatch.setattr(gpu, "TRAININGS", {"analytic": ("0,1", tiny)})
+    assert main(["gpu", "--keep", str(tmp_path / "runs")]) == 0
+    figures = json.loads((tmp_path / "gpu.json").read_text("utf-8"))["figures"]
+    assert figures["env_steps"][0]["env_steps_per_s"] > 0
+    assert [(row["seed"], row["trained_s"] > 0) for row in figures["trainings"]] == [(0, True), (1, True)]

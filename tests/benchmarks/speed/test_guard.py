@@ -6,7 +6,6 @@ from unittest.mock import Mock
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.harness.rounds import WorkerError
 from benchmarks.speed import guard
 from benchmarks.speed.guard import baseline_of, compare
 from mjx_softarm._support.errors import InputError
@@ -59,7 +58,7 @@ def machine(tmp_path, monkeypatch):
     return measured
 
 
-def test_status_tells_stored_same_worse_and_no_baseline(machine, monkeypatch, capsys):
+def test_the_status_of_stored_same_worse_and_no_baseline(machine, monkeypatch, capsys):
     assert main(["guard"]) == 2  # before anything is measured
     assert "guard.json: got no baseline of this work on Abacus, 2 cores, expected" in capsys.readouterr().err
     machine += STORED
@@ -69,7 +68,7 @@ def test_status_tells_stored_same_worse_and_no_baseline(machine, monkeypatch, ca
     assert guard.main() == 0
     machine += samples(epoch=(2.0, 2.1, 2.0), compile=(1.0, 1.3, 1.4))
     assert guard.main() == guard.WORSE
-    monkeypatch.setattr(guard, "process_costs", Mock(side_effect=WorkerError("guard: no memory")))
+    monkeypatch.setattr(guard, "process_costs", Mock(side_effect=InputError("guard: no memory")))
     assert main(["guard"]) == 2 and capsys.readouterr().err == "error: guard: no memory\n"
 
 
@@ -78,3 +77,16 @@ def test_an_uncertain_baseline_is_not_stored(machine):
     with pytest.raises(InputError, match="tolerance of settle: got more, expected at most 0.25"):
         guard.main(store=True)
     assert not guard.FILE.exists()
+
+
+def test_a_process_that_fails_is_named(monkeypatch):
+    monkeypatch.setattr(guard, "MODULE", "no_such_module")
+    with pytest.raises(InputError, match="no_such_module: got status 1, expected costs"):
+        guard.process_costs()
+
+
+@pytest.mark.slow
+def test_smoke():
+    """A real process at its sizes, a minute."""
+    costs = guard.process_costs()
+    assert costs.keys() == set(guard.WORK) and min(costs.values()) > 0.0

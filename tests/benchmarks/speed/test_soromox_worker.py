@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from contextlib import closing
 from types import SimpleNamespace
 
 import jax
@@ -9,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.harness.peers import ROOT
-from benchmarks.harness.rounds import Worker, working
+from benchmarks.harness.rounds import ROOT, Worker
 from benchmarks.speed.soromox_worker import HELD_S, N_STEPS, random_forces, section_matrices, stepper
 from benchmarks.speed.throughput import SOROMOX
 from mjx_softarm import ArmSpec
@@ -90,7 +90,8 @@ def test_the_implicit_step_is_as_long_as_mjx_s_and_every_method_has_a_row():
 @pytest.mark.skipif(not PYTHON.exists(), reason="the environment of SoRoMoX is not made")
 def test_arms_of_soromox_move_and_stay_finite():
     program = ["benchmarks.speed.soromox_worker", "implicit", "4"]
-    with working(worker := Worker("SoRoMoX", program, PYTHON)):
+    with closing(Worker("SoRoMoX", program, PYTHON)) as worker:
+        worker.start()
         assert worker.facts == {"arms": 4, "step_ms": 20.0}
         assert worker.round()["simulated_s_per_s"] > 0.0
 
@@ -104,7 +105,7 @@ def test_the_weight_stretches_the_straight_arm_and_does_not_bend_it():
         "robot = build_robot(ArmSpec.default())",
         "print(json.dumps(robot.gravitational_force(numpy.zeros(robot.num_coordinates)).tolist()))",
     )
-    told = subprocess.run([PYTHON, "-c", "; ".join(lines)], cwd=ROOT, check=True, capture_output=True)
-    bend_y, bend_z, stretch = np.reshape(json.loads(told.stdout), (-1, 3)).T
+    done = subprocess.run([PYTHON, "-c", "; ".join(lines)], cwd=ROOT, check=True, capture_output=True)
+    bend_y, bend_z, stretch = np.reshape(json.loads(done.stdout), (-1, 3)).T
     np.testing.assert_allclose([bend_y, bend_z], 0.0, atol=1e-6)
     assert (stretch < -1.0).all()  # the derivative of the weight's energy

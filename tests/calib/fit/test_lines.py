@@ -60,7 +60,7 @@ def test_a_common_curvature_agrees_with_scipy():
 def test_draw_wires_of_a_real_arm(log, rms_mm):
     """SciPy's lines come back; at rest held-out errors are at most those of the data's own page."""
     asu = read_asu(DATA / ASU_LOGS[log])
-    x, y = asu.wire_m[:, :2].mean(axis=1), asu.section_m
+    x, y = asu.wire_m, asu.section_m
     still = still_rows(asu.time_s, x) & still_rows(asu.time_s, y)
     for rows in (asu.fresh, asu.fresh & still):
         fit = fit_line(x[rows, None], y[rows, None])
