@@ -45,9 +45,9 @@ def sensed_model(spec: ArmSpec) -> mujoco.MjModel:
     return mjspec.compile()
 
 
-def _springs(data: mujoco.MjData) -> np.ndarray:
+def _springs(data: mujoco.MjData, spec: ArmSpec) -> np.ndarray:
     """Return the spring lengths (n_springs,) [m]; imports no JAX, as `mechanics.mjcf` does."""
-    return data.ten_length[data.ctrl.size :]
+    return data.ten_length[spec.n_chambers : spec.n_chambers + spec.n_springs]
 
 
 class RestDetector:
@@ -112,7 +112,7 @@ class SteppedArms:
             mujoco.mj_resetData(self.model, data)
             data.qpos[:] = coordinates
             mujoco.mj_fwdPosition(self.model, data)
-            self.length_m[index] = _springs(data)
+            self.length_m[index] = _springs(data, self.spec)
         self._remember(arms, control.LawState.at_rest(pressure_kpa, self.length_m[arms]))
 
     def _remember(self, arms: slice | np.ndarray, law: control.LawState) -> None:
@@ -162,7 +162,7 @@ class SteppedArms:
         if self._rollout is None:
             self._data[0].ctrl[:] = pressure_kpa[0]
             mujoco.mj_step(self.model, self._data[0], self._n_steps)
-            self.length_m[0] = _springs(self._data[0])
+            self.length_m[0] = _springs(self._data[0], self.spec)
         else:
             state, sensed = self._rollout.rollout(
                 self.model, self._data, self._state[arms], pressure_kpa[:, None], nstep=self._n_steps

@@ -16,7 +16,7 @@ from mjx_softarm.mechanics.statics import statics
 from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS, TAPERED
 
 SPEC = ArmSpec.default()
-SHORT = SPEC.replace(structure={"n_sections": 2, "links_per_section": 2})
+SHORT = SPEC.replace(structure={"n_sections": 2, "links_per_section": 2}, chambers={"bonded_share": 0.7})
 ONE = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
 DIFFERENTIATED = {
     "three": SHORT,

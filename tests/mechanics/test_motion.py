@@ -72,9 +72,9 @@ def true_tips(spec, q, pressure_kpa, reference_m, step_s=TRUE_STEP_S, model=None
     n = spec.n_chambers
     air = spec.pneumatics(chamber_lengths(data, n), step_s)
     air.hold(pressure_kpa, chamber_lengths(data, n))
-    law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data, n)), []
+    law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data, n, n)), []
     for reference in reference_m:
-        command, law = control.pressures(reference, spring_lengths(data, n), law, GAINS, PERIOD_S)
+        command, law = control.pressures(reference, spring_lengths(data, n, n), law, GAINS, PERIOD_S)
         air.command(command)
         for _ in range(round(PERIOD_S / step_s)):
             data.ctrl[:] = air.step(chamber_lengths(data, n))

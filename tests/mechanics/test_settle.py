@@ -194,7 +194,7 @@ def test_redundant_chambers_within_their_limits_hold_a_plane_of_references_with_
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in ArmParams._fields if name not in ("whole_stiffness", "allocation")]
+    "name", [name for name in ArmParams._fields if name not in ("bonded_share", "allocation")]
 )
 def test_parameters_that_are_not_numbers_settle_nothing(name):
     params = ArmParams.from_spec(SPEC)
