@@ -117,10 +117,10 @@ def mover(spec, engine=midpoint, step_s=PERIOD_S, longest_delay_s=0.0):
     return lambda *args, params=nominal: many(*args, params)
 
 
-@pytest.mark.parametrize("links", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_transients_of_both_engines_are_those_of_c_mujoco(links):
+@pytest.mark.parametrize(("links", "share"), [(2, 1.0), pytest.param(4, 0.0, marks=pytest.mark.slow)])
+def test_transients_of_both_engines_are_those_of_c_mujoco(links, share):
     """Within 1 mm at 95 % over 2 s, with a random reference each half second."""
-    spec = SPEC.replace(structure={"links_per_section": links})
+    spec = SPEC.replace(structure={"links_per_section": links}, chambers={"bonded_share": share})
     n_arms = 2 * links  # 4, and 8 in the slow test
     start, asked = starts(spec, n_arms), references(spec, n_arms)
     true = np.array([true_tips(spec, *each) for each in zip(*start, asked, strict=True)])
