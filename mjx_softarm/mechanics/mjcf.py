@@ -73,7 +73,7 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
         _add_spring(mjspec, spring, params, spec)
     if params.bonded_share is not None:
         for chamber in range(spec.n_chambers):
-            _add_bonds(mjspec, chamber, params, spec)
+            _add_bonds(mjspec, chamber, float(params.bonded_share), params, spec)
     return mjspec
 
 
@@ -231,7 +231,7 @@ def _add_spring(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmS
     tendon.rgba = _SPRING_COLOUR
 
 
-def _add_bonds(mjspec: mujoco.MjSpec, chamber: int, params: ArmParams, spec: ArmSpec) -> None:
+def _add_bonds(mjspec: mujoco.MjSpec, chamber: int, share: float, params: ArmParams, spec: ArmSpec) -> None:
     """Add the tendons that a chamber is from ring to ring where it is bonded."""
     links = spec.structure.links_per_section
     first = chamber // spec.structure.chambers_per_section * links
@@ -239,7 +239,7 @@ def _add_bonds(mjspec: mujoco.MjSpec, chamber: int, params: ArmParams, spec: Arm
         bond = mjspec.add_tendon(name=f"bond{chamber}_{plate}")
         bond.wrap_site(f"chamber{chamber}_plate{plate}")
         bond.wrap_site(f"chamber{chamber}_plate{plate + 1}")
-        bond.stiffness = _polynomial(float(links * params.bonded_share * params.chamber_stiffness[chamber]))
+        bond.stiffness = _polynomial(float(links * share * params.chamber_stiffness[chamber]))
         bond.springlength = [float(params.chamber_rest_m[chamber]) / links] * 2
         bond.rgba = [0.0] * 4  # the chamber's own tendon is drawn
 

@@ -134,19 +134,20 @@ def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, par
     pull = jnp.sum(tension[:, :, None] * both.jacobian, axis=1)  # (n_sections, n, *arms)
     own = hessian.own + _bending(tension, both.link_hessian) + stretching(slope, both.jacobian)
     if params.bonded_share is not None:
-        bond_pull, bond_hessian = _bonds(both, params)
+        bond_pull, bond_hessian = _bonds(both, params.bonded_share, params)
         pull, own = pull + bond_pull, own + bond_hessian
     gradient = weight + params.joint_stiffness * q + pull.reshape(q.shape)
     hessian = hessian._replace(own=own).plus_diagonal(params.joint_stiffness)
     return Statics(gradient, hessian, chambers, springs, area)
 
 
-def _bonds(both: Tendons, params: ArmParams) -> tuple[Array, Array]:
+def _bonds(both: Tendons, share: Array, params: ArmParams) -> tuple[Array, Array]:
     """Return gradient (n_sections, n, *arms) and Hessian (n_sections, n, n, *arms) of the bonds' energy."""
     # Stiffness of each bond, and the pull of each segment beyond that of its chamber
     c, links = params.chamber_site_m.shape[1], both.segment.shape[2]
     length, segment, jacobian = (x[:, :c] for x in (both.length, both.segment, both.jacobian))
-    stiffness = (params.bonded_share * params.chamber_stiffness).reshape(-1, c, *params.bonded_share.shape)
+    stiffness = share * params.chamber_stiffness
+    stiffness = stiffness.reshape(-1, c, *stiffness.shape[1:])
     tension = stiffness[:, :, None] * (links * segment - length[:, :, None])  # (n_sections, c, links, *arms)
 
     # Each segment's own second derivatives, less the chambers' as a whole

@@ -70,7 +70,10 @@ CHANGES = {
     "the paper's": {},
     "loaded": {"mass": {"payload_kg": 1.0}},
     "overloaded": {"mass": {"payload_kg": 50.0}},
-    "one section of two links": {"structure": {"n_sections": 1, "links_per_section": 2}},
+    "one section of two links": {
+        "structure": {"n_sections": 1, "links_per_section": 2},
+        "chambers": {"bonded_share": 0.5},
+    },
     "light, lies": {"mounting": {"base_turn_deg": (90.0, 0.0, 0.0)}, "mass": LIGHT},
     "uneven": {
         "chambers": {
