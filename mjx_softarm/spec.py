@@ -38,7 +38,7 @@ ARM_FILE = "arm.toml"  # in the folder of a calibration
 SHAPE_SHARE = 0.65
 MOST_RATIO = 3.0  # of a spring's length and that of its section, either way; larger ratios are input errors
 LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
-BONDS = -0.3, 2.0  # of rods whose springs are bonded, too, calibrations find up to 1.5
+BONDS = -0.3, 2.0  # of rods, whose springs are bonded, too, calibrations find up to 1.3
 # Upper bounds that no soft arm exceeds, but its number in another unit does.
 LENGTH = {"high": 2.0, "unit": "m, not mm"}
 MASS = {"high": 50.0, "unit": "kg, not g"}
