@@ -141,7 +141,7 @@ def _look(arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.nda
     mujoco.mj_tendon(model, data)
     tip = data.site("tip")
     marker_m = np.stack([data.site(name).xpos for name in _marker_sites(arm)])
-    spring_m = spring_lengths(data, arm.n_chambers).copy()
+    spring_m = spring_lengths(data, arm.n_chambers, arm.n_springs).copy()
     return _Seen(spring_m, tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m)
 
 

@@ -28,7 +28,6 @@ from mjx_softarm._support.fields import (
     share,
     vector,
 )
-from mjx_softarm._support.xp import Array
 from mjx_softarm.arms import shipped_arm
 from mjx_softarm.pneumatics import ACTUATORS, PAPER_PUMP, Actuators, Pneumatics
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
@@ -39,7 +38,7 @@ ARM_FILE = "arm.toml"  # in the folder of a calibration
 SHAPE_SHARE = 0.65
 MOST_RATIO = 3.0  # of a spring's length and that of its section, either way; larger ratios are input errors
 LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
-BONDS = -0.3, 0.95  # a bonded share of 1 would leave no chamber that pulls between the ends of its section
+BONDS = -0.3, 2.0  # of rods, whose springs are bonded, too, calibrations find up to 1.3
 # Upper bounds that no soft arm exceeds, but its number in another unit does.
 LENGTH = {"high": 2.0, "unit": "m, not mm"}
 MASS = {"high": 50.0, "unit": "kg, not g"}
@@ -94,8 +93,10 @@ class Chambers:
     """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length)).
 
     A bellows that is free between the ends of its section resists a change of its length alone. One that is
-    bonded to every ring resists the bend of each link, too: `bonded_share` of its stiffness does, of its
-    damping nothing. A negative share makes links softer, as more of them would be.
+    bonded to every ring resists a change of each of its pieces, from ring to ring. `bonded_share` is 0 for
+    free and 1 for bonded chambers, see `mjx_softarm.mechanics.statics`. Above 1 something else is bonded,
+    too, such as the springs; a negative share makes links softer. Damping and pressure act on the whole
+    length.
     """
 
     area_m2: PerChamber = positive(per="chambers", **AREA)
@@ -106,24 +107,6 @@ class Chambers:
     pressure_min_kpa: float = anything(low=-101.325, **PRESSURE)
     pressure_max_kpa: float = anything(low=-101.325, **PRESSURE)
     bonded_share: float = share(*BONDS)
-
-
-def bonded_stiffness(share: Array, stiffness: Array, square_m2: Array) -> tuple[Array, Array, Array]:
-    """Return what the bonded chambers of each section are worth (n_sections,).
-
-    Each chamber of a section gives its links the same stiffness, a share of that of the least stiff one.
-
-    Args:
-        share: bonded share.
-        stiffness (n_sections, c) [N/m]: stiffnesses of the chambers.
-        square_m2 (n_sections,) [m^2]: mean square of their distances from the section's axis.
-
-    Returns:
-        Stiffness [N/m] that each chamber gives; axial [N/m] and bending stiffness [N m/rad] of a section.
-    """
-    shared = share * stiffness.min(axis=1)
-    axial = stiffness.shape[1] * shared
-    return shared, axial, axial * square_m2 / 2
 
 
 @dataclass(frozen=True)
@@ -275,11 +258,11 @@ class ArmSpec:
         return float(np.mean(np.divide(damping, bending / SHAPE_SHARE + self._bonded()[1])))
 
     def _bonded(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the stiffnesses [N/m, N m/rad] (n_sections,) of bonded chambers."""
+        """Return stiffnesses [N/m, N m/rad] (n_sections,) of bonds against links unlike each other."""
         stiffness = self.per_chamber(self.chambers.stiffness_n_per_m)
-        each = np.reshape(stiffness, (-1, self.structure.chambers_per_section))
-        square_m2 = np.square(self.per_section(self.geometry.chamber_radius_m))
-        return bonded_stiffness(self.chambers.bonded_share, each, square_m2)[1:]
+        axial = np.reshape(stiffness, (-1, self.structure.chambers_per_section)).sum(axis=1)
+        axial = self.chambers.bonded_share * axial
+        return axial, axial * np.square(self.per_section(self.geometry.chamber_radius_m)) / 2
 
     @property
     def section_roll_deg(self) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Arms besides the paper's: short, of four and of six chambers a section, and of tapered sections."""
+"""Arms besides the paper's: short, of four and of six chambers a section, tapered and bonded ones."""
 
 from mjx_softarm import ArmSpec
 
@@ -42,7 +42,8 @@ TAPERED = _PAPER.replace(
         "chamber_diameter_m": _tapered(0.06, 1),
     },
     mass={"arm_kg": (1.7, 1.4, 1.0)},
-    chambers={name: _tapered(value, each=3) for name, value in _chambers(1.0).items()},
+    chambers={name: _tapered(value, each=3) for name, value in _chambers(1.0).items()}
+    | {"bonded_share": 1.0},
     backbone={
         "axial_stiffness_n_per_m": _tapered(_PAPER.backbone.axial_stiffness_n_per_m),
         "bending_stiffness_nm_per_rad": _tapered(_PAPER.backbone.bending_stiffness_nm_per_rad, 4),

@@ -77,7 +77,7 @@ class SteppedArms:
 
         # Straight arms
         mujoco.mj_fwdPosition(model, self._data[0])
-        straight_m = np.asarray(spring_lengths(self._data[0], spec.n_chambers))
+        straight_m = np.asarray(spring_lengths(self._data[0], spec.n_chambers, spec.n_springs))
         self._state = np.zeros((n, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         self.length_m, self.tip_m = np.tile(straight_m, (n, 1)), np.zeros((n, 3))
         law = control.LawState.at_rest(np.zeros((n, spec.n_chambers)), self.length_m)
@@ -104,7 +104,8 @@ class SteppedArms:
             data = self._data[0]
             data.ctrl[:] = pressure_kpa[0]
             mujoco.mj_step(self._model, data, self._n_steps)
-            self.length_m[0], self.tip_m[0] = data.ten_length[data.ctrl.size :], data.site("tip").xpos
+            self.length_m[0] = spring_lengths(data, self._spec.n_chambers, self._spec.n_springs)
+            self.tip_m[0] = data.site("tip").xpos
             return
         state, sensed = self._rollout.rollout(
             self._model, self._data, self._state[arms], pressure_kpa[:, None], nstep=self._n_steps

@@ -29,7 +29,7 @@ from calib.fit.pose_errors import PoseErrors, errors_of
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import BONDS, ArmSpec
 
 MIN_POSES = 20
 ENOUGH_POSES = 100
@@ -191,7 +191,15 @@ def _errors(error: np.ndarray, spec: ArmSpec) -> PoseErrors:
 
 def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:
     # Look at the fit and its poses.
-    said = [] if solution.converged else [NOT_CONVERGED]
+    share, said = found.spec.chambers.bonded_share, []
+    if share in BONDS:  # its derivative stays there, so that no fit converges
+        evenly = "more" if share == max(BONDS) else "less"
+        said.append(
+            f"bonded_share is at its bound, {share:g}: the links of a section bend {evenly} evenly than any "
+            "bond makes them: check [mass] of the specification, whose weights bend them, and the payload"
+        )
+    elif not solution.converged:
+        said.append(NOT_CONVERGED)
     if found.poses.n < ENOUGH_POSES:
         said.append(f"got {found.poses.n} poses at rest, expected {ENOUGH_POSES} or more: log more poses")
     if n_unsettled := np.count_nonzero(np.isnan(found.tip_error_mm)):

@@ -150,12 +150,12 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
     joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
     mount, zero = params.mount, jnp.zeros(1, x.dtype)
     base_turn = _turned(jnp.concatenate([by["base turn"], zero]))
-    free = params._replace(
+    share = by[BOND][0]
+    return params._replace(
         chamber_site_m=_rolled(params.chamber_site_m, by["roll"]),
         spring_site_m=_rolled(params.spring_site_m, by["roll"]),
         joint_stiffness=joints.reshape(-1),
         chamber_stiffness=params.chamber_stiffness * jnp.exp(by["stiffness"]),
-        whole_stiffness=params.whole_stiffness * jnp.exp(by["stiffness"]),
         area=params.area * jnp.exp(by["area"]),
         area_slope=params.area_slope + by["slope"] * params.area / params.free_length_m,
         chamber_rest_m=params.chamber_rest_m + by["offset"] * params.free_length_m,
@@ -165,10 +165,9 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
             tip_offset_m=mount.tip_offset_m + jnp.concatenate([by["tip offset"], zero]),
             tip_rotation=product(jnp.asarray(mount.tip_rotation), _turned(by["tip turn"])),
         ),
+        # At a limit the derivative stays, or the share would count as unknown
+        bonded_share=share + jax.lax.stop_gradient(jnp.clip(share, *BONDS) - share),
     )
-    # At a limit the derivative stays, or the share would count as unknown
-    share = by[BOND][0]
-    return free.bonded(share + jax.lax.stop_gradient(jnp.clip(share, *BONDS) - share))
 
 
 def free_arm(spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, ArmParams]:

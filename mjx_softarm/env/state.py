@@ -38,7 +38,7 @@ class ArmState(NamedTuple):
     """State of one arm between two actions."""
 
     payload_kg: Array  # () payload of this episode
-    chamber_stiffness: Array  # (n_chambers,) [N/m] free stiffnesses of this episode
+    chamber_stiffness: Array  # (n_chambers,) [N/m] stiffnesses of this episode
     sensor_offset_m: Array  # (n_springs,) error of each spring's reading in this episode
     moving: MotionParams  # parameters of motion in this episode
     motion: Motion  # joint coordinates, velocities, pressures

@@ -4,6 +4,9 @@ Names: bodies `link{i}`, `gripper`, `payload`; joints `slide{i}`, `bend_x{i}`, `
 actuators `chamber{i}`, tendons `spring{i}`; site `tip`. Links count from 0 at the base, chambers and
 springs from 0 section by section. All chambers come before all springs. An actuator's control is its
 chamber's pressure in kPa.
+
+Bonded chambers (see `mjx_softarm.mechanics.statics`) have tendons `bond{i}_{link}` as well, one for each
+link, which come last. A chamber's own tendon then has the stiffness (1 - b) k, each of its n bonds b n k.
 """
 
 from __future__ import annotations
@@ -68,6 +71,9 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
         _add_chamber(mjspec, chamber, params, spec)
     for spring in range(spec.n_springs):
         _add_spring(mjspec, spring, params, spec)
+    if params.bonded_share is not None:
+        for chamber in range(spec.n_chambers):
+            _add_bonds(mjspec, chamber, float(params.bonded_share), params, spec)
     return mjspec
 
 
@@ -81,9 +87,9 @@ def chamber_lengths(data: Any, n_chambers: int) -> Array:
     return data.ten_length[:n_chambers]
 
 
-def spring_lengths(data: Any, n_chambers: int) -> Array:
+def spring_lengths(data: Any, n_chambers: int, n_springs: int) -> Array:
     """Return the springs' lengths (n_springs,) [m], a view, from the data of MuJoCo or MJX."""
-    return data.ten_length[n_chambers:]
+    return data.ten_length[n_chambers : n_chambers + n_springs]
 
 
 def build_model(spec: ArmSpec) -> mujoco.MjModel:
@@ -101,8 +107,12 @@ def loaded(model: mjx.Model, link_mass_kg: Array, tool_mass_kg: Array) -> mjx.Mo
 def episode_model(model: mjx.Model, params: ArmParams) -> mjx.Model:
     """Return a model on the device with the masses and the tendons' stiffnesses of `params`."""
     model = loaded(model, params.link_mass_kg, params.tool_mass_kg)
-    stiffness = jnp.concatenate([params.chamber_stiffness, params.spring_stiffness])
-    return model.replace(tendon_stiffness=stiffness)
+    chambers, springs, share = params.chamber_stiffness, params.spring_stiffness, params.bonded_share
+    if share is None:
+        return model.replace(tendon_stiffness=jnp.concatenate([chambers, springs]))
+    links = len(params.link_length_m) // params.n_sections
+    bonds = jnp.repeat(links * share * chambers, links)
+    return model.replace(tendon_stiffness=jnp.concatenate([(1.0 - share) * chambers, springs, bonds]))
 
 
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
@@ -192,7 +202,8 @@ def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: Arm
     """
     section = index // spec.structure.chambers_per_section
     tendon = _add_tendon(mjspec, f"chamber{index}", section, spec)
-    tendon.stiffness = _polynomial(float(params.chamber_stiffness[index]))
+    share = 0.0 if params.bonded_share is None else float(params.bonded_share)
+    tendon.stiffness = _polynomial((1.0 - share) * float(params.chamber_stiffness[index]))
     tendon.damping = _polynomial(spec.per_chamber(spec.chambers.damping_ns_per_m)[index])
     tendon.springlength = [float(params.chamber_rest_m[index])] * 2
     tendon.width = _BELLOWS_DRAWN * spec.per_section(spec.geometry.chamber_diameter_m)[section]
@@ -218,6 +229,19 @@ def _add_spring(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmS
     tendon.springlength = [float(params.spring_rest_m[index])] * 2
     tendon.width = SPRING_WIDTH_M
     tendon.rgba = _SPRING_COLOUR
+
+
+def _add_bonds(mjspec: mujoco.MjSpec, chamber: int, share: float, params: ArmParams, spec: ArmSpec) -> None:
+    """Add the tendons that a chamber is from ring to ring where it is bonded."""
+    links = spec.structure.links_per_section
+    first = chamber // spec.structure.chambers_per_section * links
+    for plate in range(first, first + links):
+        bond = mjspec.add_tendon(name=f"bond{chamber}_{plate}")
+        bond.wrap_site(f"chamber{chamber}_plate{plate}")
+        bond.wrap_site(f"chamber{chamber}_plate{plate + 1}")
+        bond.stiffness = _polynomial(float(links * share * params.chamber_stiffness[chamber]))
+        bond.springlength = [float(params.chamber_rest_m[chamber]) / links] * 2
+        bond.rgba = [0.0] * 4  # the chamber's own tendon is drawn
 
 
 def _add_tendon(mjspec: mujoco.MjSpec, name: str, section: int, spec: ArmSpec) -> mujoco.MjsTendon:

@@ -55,7 +55,7 @@ def measured(model: mjx.Model, data: mjx.Data, params: ArmParams, proposed: Sett
     # A residual that is NaN is no balance
     unbalanced = proposed.settled & ~(residual < RESIDUAL_TOLERANCE)
     return proposed._replace(
-        spring_m=spring_lengths(data, len(params.area)),
+        spring_m=spring_lengths(data, len(params.area), len(params.spring_rest_m)),
         tip_position_m=tip_position_m,
         tip_rotation=tip_rotation,
         residual=residual,

@@ -15,7 +15,7 @@ from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_direc
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
-from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec, bonded_stiffness
+from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
@@ -49,8 +49,7 @@ class ArmParams(NamedTuple):
     tool_mass_kg: Array  # (2,) gripper and payload, below the last plate
     tool_offset_m: Array  # (2,)
     joint_stiffness: Array  # (3 * n_links,) [N/m, N m/rad, N m/rad]
-    chamber_stiffness: Array  # (n_chambers,) [N/m] of the part that is free between the ends of a section
-    whole_stiffness: Array  # (n_chambers,) [N/m] with the part that is bonded to the links
+    chamber_stiffness: Array  # (n_chambers,) [N/m]
     chamber_rest_m: Array  # (n_chambers,)
     area: Array  # (n_chambers,) [N/kPa]
     area_slope: Array  # (n_chambers,) [N/kPa/m]
@@ -60,6 +59,7 @@ class ArmParams(NamedTuple):
     pressure_min_kpa: Array  # (n_chambers,)
     pressure_max_kpa: Array  # (n_chambers,)
     mount: Mount
+    bonded_share: Array | None = None  # () see `mjx_softarm.mechanics.statics`; None: free chambers
     allocation: Allocation | None = None  # of arms with redundant chambers, see `mjx_softarm.control`
 
     @property
@@ -97,36 +97,12 @@ class ArmParams(NamedTuple):
             spring_rest_m=jnp.where(held, pull / stiffness, self.spring_rest_m),
         )
 
-    def bonded(self, share: Array | np.ndarray) -> ArmParams:
-        """Return this arm of free chambers with a share of them bonded.
-
-        To first order in bends and stretches, links that are alike are as stiff as before. Joints are linear
-        and tendons are not: links of the paper's arm that are bent by 0.1 rad and stretched by 10 mm push
-        back by 9 % more with a share of 0.9.
-        """
-        # Stiffness that each chamber of a section gives
-        xp = array_namespace(self.chamber_stiffness)
-        n_sections, c, _ = self.chamber_site_m.shape
-        stiffness = self.chamber_stiffness.reshape(n_sections, c)
-        free_m = self.free_length_m
-        square_m2 = xp.mean(xp.sum(self.chamber_site_m**2, axis=-1), axis=1)
-        given, axial, bend = bonded_stiffness(share, stiffness, square_m2)  # (n_sections,) each
-        left = (stiffness - given[:, None]).reshape(-1)
-        # Joints that take it: stretching, and bending about x and y
-        per_section = self.link_length_m.shape[0] // n_sections
-        joints = per_section * xp.stack([axial, bend, bend], axis=-1)
-        joints = xp.broadcast_to(joints[:, None], (n_sections, per_section, 3)).reshape(-1)
-        return self._replace(
-            chamber_stiffness=left,
-            # Rest lengths pull as before at the section's length
-            chamber_rest_m=free_m + self.chamber_stiffness / left * (self.chamber_rest_m - free_m),
-            joint_stiffness=self.joint_stiffness + joints,
-        )
-
     def stiffened(self, factor: Array) -> ArmParams:
-        """Return the arm with its chambers' stiffnesses times factors (n_chambers,), bonds unchanged."""
-        stiffness = self.chamber_stiffness + (factor - 1.0) * self.whole_stiffness
-        return self._replace(chamber_stiffness=stiffness)
+        """Return the arm with its chambers' stiffnesses times factors (n_chambers,)."""
+        # Rounded as in the published results
+        return self._replace(
+            chamber_stiffness=self.chamber_stiffness + (factor - 1.0) * self.chamber_stiffness
+        )
 
     @classmethod
     def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
@@ -149,7 +125,6 @@ class ArmParams(NamedTuple):
             "tool_offset_m": [spec.mass.gripper_length_m / 2, spec.mass.gripper_length_m],
             "joint_stiffness": np.repeat(joints, per_section, axis=0).ravel(),
             "chamber_stiffness": spec.per_chamber(chambers.stiffness_n_per_m),
-            "whole_stiffness": spec.per_chamber(chambers.stiffness_n_per_m),
             "chamber_rest_m": spec.at_chambers(geometry.section_length_m)
             + np.array(spec.per_chamber(chambers.length_offset_m)),
             "area": 1e3 * np.array(spec.per_chamber(chambers.area_m2)),
@@ -162,8 +137,8 @@ class ArmParams(NamedTuple):
         }
         numbers = {name: np.asarray(value, dtype) for name, value in values.items()}
         matrices = jax.tree.map(lambda matrix: matrix.astype(dtype), allocation(spec))
-        free = cls(**numbers, mount=_mount(spec, dtype), allocation=matrices)  # type: ignore
-        return free.bonded(np.asarray(chambers.bonded_share, dtype))
+        share = np.asarray(chambers.bonded_share, dtype) if chambers.bonded_share else None
+        return cls(**numbers, mount=_mount(spec, dtype), bonded_share=share, allocation=matrices)  # type: ignore
 
 
 def _law_stiffness(spec: ArmSpec) -> np.ndarray:

@@ -8,6 +8,14 @@ where W' = area_m2 + area_slope_m (l - L) is a chamber's effective area and L th
 work of the air. A tendon runs from ring to ring, so a segment depends on the three joints of its link
 alone, and a length on the joints of its section. Only gravity couples sections.
 
+A chamber that is bonded to every ring of its n links is n springs in series that share no force, each of
+stiffness n k and rest length l0 / n. A share b of it, `bonded_share`, adds to a free chamber's energy
+
+    b [sum_i n k (l_i - l0 / n)^2 / 2 - k (l - l0)^2 / 2]  =  b n k / 2  sum_i (l_i - l / n)^2,
+
+with the lengths l_i of its segments, whose sum is l. So b = 1 is a bonded chamber, exactly, and any b leaves
+sections of like segments as they are. Segment i pulls with k (l - l0) + b k (n l_i - l).
+
 Many arms come last in every shape, (..., *arms), as in `mjx_softarm.mechanics.kinematics`.
 """
 
@@ -32,6 +40,7 @@ class Tendons(NamedTuple):
     """Lengths of t tendons a section with first and second derivatives, by the joints that they depend on."""
 
     length: Array  # (n_sections, t, *arms) [m]
+    segment: Array  # (n_sections, t, links per section, *arms) [m] lengths from ring to ring
     jacobian: Array  # (n_sections, t, n, *arms) by the n joints of a section
     link_hessian: Array  # (3 dofs, 3 dofs, t, n_links, *arms) by the joints of a link
 
@@ -42,7 +51,9 @@ class Tendons(NamedTuple):
         of_joint = jnp.moveaxis(dq.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)[:, None, None]
         turned = jnp.sum(self.link_hessian * of_joint, axis=0)  # (3 dofs, t, n_links, *arms)
         zeros = jnp.zeros_like(self.link_hessian)
-        return Tendons(jnp.sum(self.jacobian * along, axis=2), _by_section(turned, n_sections), zeros)
+        stretch = self.jacobian * along
+        segment = _by_link(stretch, self.segment.shape[2]).sum(axis=3)
+        return Tendons(jnp.sum(stretch, axis=2), segment, _by_section(turned, n_sections), zeros)
 
 
 class Lines(NamedTuple):
@@ -118,13 +129,44 @@ def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, par
     of_springs = jnp.broadcast_to(params.spring_stiffness, springs.length.shape)
     slope = joined(of_chambers, of_springs, params.n_sections)
 
-    # Gradient and Hessian: gravity, joints and tendons
+    # Gradient and Hessian: gravity, joints, tendons and bonds
     weight, hessian = _gravity(frames, params)
     pull = jnp.sum(tension[:, :, None] * both.jacobian, axis=1)  # (n_sections, n, *arms)
-    gradient = weight + params.joint_stiffness * q + pull.reshape(q.shape)
     own = hessian.own + _bending(tension, both.link_hessian) + stretching(slope, both.jacobian)
+    if params.bonded_share is not None:
+        bond_pull, bond_hessian = _bonds(both, params.bonded_share, params)
+        pull, own = pull + bond_pull, own + bond_hessian
+    gradient = weight + params.joint_stiffness * q + pull.reshape(q.shape)
     hessian = hessian._replace(own=own).plus_diagonal(params.joint_stiffness)
     return Statics(gradient, hessian, chambers, springs, area)
+
+
+def _bonds(both: Tendons, share: Array, params: ArmParams) -> tuple[Array, Array]:
+    """Return gradient (n_sections, n, *arms) and Hessian (n_sections, n, n, *arms) of the bonds' energy."""
+    # Stiffness of each bond, and the pull of each segment beyond that of its chamber
+    c, links = params.chamber_site_m.shape[1], both.segment.shape[2]
+    length, segment, jacobian = (x[:, :c] for x in (both.length, both.segment, both.jacobian))
+    stiffness = share * params.chamber_stiffness
+    stiffness = stiffness.reshape(-1, c, *stiffness.shape[1:])
+    tension = stiffness[:, :, None] * (links * segment - length[:, :, None])  # (n_sections, c, links, *arms)
+
+    # Each segment's own second derivatives, less the chambers' as a whole
+    by_link = _by_link(jacobian, links)
+    per_link = jnp.sum(tension[:, :, :, None] * by_link, axis=1)  # (n_sections, links, 3 dofs, *arms)
+    curve = jnp.moveaxis(both.link_hessian[:, :, :c], 3, 0)  # (n_links, 3 dofs, 3 dofs, c, *arms)
+    curve = curve.reshape(-1, links, *curve.shape[1:])
+    pulls = jnp.moveaxis(tension, 1, 2)[:, :, None, None]
+    steep = jnp.moveaxis(by_link * (links * stiffness)[:, :, None, None], 1, 3)  # (n_sections, links, 3, c)
+    flat = jnp.moveaxis(by_link, 1, 3)
+    own = jnp.sum(pulls * curve + steep[:, :, :, None] * flat[:, :, None], axis=4)
+    whole = stretching(-stiffness, jacobian)
+    return per_link.reshape(len(length), -1, *tension.shape[3:]), jax.vmap(block_diagonal)(own) + whole
+
+
+def _by_link(of_joints: Array, links: int) -> Array:
+    """Return numbers (n_sections, t, n, *arms) of joints as (n_sections, t, links, 3 dofs, *arms)."""
+    n_sections, t, _, *arms = of_joints.shape
+    return of_joints.reshape(n_sections, t, links, DOFS_PER_LINK, *arms)
 
 
 def joined(of_chambers: Array, of_springs: Array, n_sections: int) -> Array:
@@ -194,6 +236,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     whole = length.reshape(t, n_sections, per_section, *arms).sum(2)
     return Tendons(
         length=jnp.swapaxes(whole, 0, 1),
+        segment=jnp.swapaxes(length.reshape(t, n_sections, per_section, *arms), 0, 1),
         jacobian=_by_section(jnp.stack(dlength_dq), n_sections),
         link_hessian=jnp.stack([jnp.stack([upper_half[min(i, j), max(i, j)] for j in dofs]) for i in dofs]),
     )

@@ -170,7 +170,7 @@ class Twin(InstrumentedArm):
         self.time_s += self._steps * self._model.opt.timestep
 
     def _lengths_m(self) -> np.ndarray:
-        return spring_lengths(self._data, self._parts.spec.n_chambers)
+        return spring_lengths(self._data, self._parts.spec.n_chambers, self._parts.spec.n_springs)
 
     def _true_kpa(self) -> np.ndarray:
         return self._air.pressure_kpa

@@ -16,7 +16,6 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.ending import Ending
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
 from mjx_softarm.deploy.record import STEP_SHARE, prediction_errors_mm, record
-from mjx_softarm.logs import rest
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mechanics.body import holes_m, spring_directions
 from mjx_softarm.mechanics.excitation import growing, random_pressures

@@ -62,11 +62,11 @@ def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     period_s = steps_per_tick * model.opt.timestep
-    law = control.LawState.at_rest(np.zeros(model.nu), spring_lengths(data, model.nu))
+    law = control.LawState.at_rest(np.zeros(model.nu), spring_lengths(data, model.nu, model.nu))
     for _ in range(max_ticks):
         before = law.integral_kpa
         data.ctrl[:], law = control.pressures(
-            reference_m, spring_lengths(data, model.nu), law, gains, period_s
+            reference_m, spring_lengths(data, model.nu, model.nu), law, gains, period_s
         )
         mujoco.mj_step(model, data, steps_per_tick)
         drift = np.abs(law.integral_kpa - before).max() / period_s
@@ -82,7 +82,7 @@ def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11
     return Rest(
         q=data.qpos.copy(),
         pressure_kpa=data.ctrl.copy(),
-        spring_m=spring_lengths(data, model.nu).copy(),
+        spring_m=spring_lengths(data, model.nu, model.nu).copy(),
         tip_position_m=tip.xpos.copy(),
         tip_rotation=tip.xmat.reshape(3, 3).copy(),
         residual=np.abs(left).max(),
@@ -132,13 +132,13 @@ def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
         def tick(carry, _):
             data, law = carry
             pressure, law = control.pressures(
-                reference, spring_lengths(data, model.nu), law, FAST_GAINS, FAST_STEP_S
+                reference, spring_lengths(data, model.nu, model.nu), law, FAST_GAINS, FAST_STEP_S
             )
             return (mjx.step(model, data.replace(ctrl=pressure)), law), None
 
         straight_m = jnp.full(model.ntendon, SPEC.geometry.section_length_m)
         start = mjx.make_data(model).replace(ten_length=straight_m)
-        law = control.LawState.at_rest(jnp.zeros(model.nu), spring_lengths(start, model.nu))
+        law = control.LawState.at_rest(jnp.zeros(model.nu), spring_lengths(start, model.nu, model.nu))
         (data, law), _ = jax.lax.scan(tick, (start, law), None, length=n_ticks)
         return data.qpos, data.qvel, law.integral_kpa
 

@@ -69,7 +69,10 @@ CHANGES = {
     "the paper's": {},
     "loaded": {"mass": {"payload_kg": 1.0}},
     "overloaded": {"mass": {"payload_kg": 50.0}},
-    "one section of two links": {"structure": {"n_sections": 1, "links_per_section": 2}},
+    "one section of two links": {
+        "structure": {"n_sections": 1, "links_per_section": 2},
+        "chambers": {"bonded_share": 0.5},
+    },
     "light, lies": {"mounting": {"base_turn_deg": (90.0, 0.0, 0.0)}, "mass": LIGHT},
     "uneven": {
         "chambers": {
@@ -193,7 +196,7 @@ def test_redundant_chambers_within_their_limits_hold_a_plane_of_references_with_
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in ArmParams._fields if name not in ("whole_stiffness", "allocation")]
+    "name", [name for name in ArmParams._fields if name not in ("bonded_share", "allocation")]
 )
 def test_parameters_that_are_not_numbers_settle_nothing(name):
     params = ArmParams.from_spec(SPEC)

@@ -55,7 +55,7 @@ def test_every_sampled_pose_is_a_rest_of_c_mujoco():
         angles = Rotation.from_matrix(tip.xmat.reshape(3, 3)).as_euler("ZYX", degrees=True)
         np.testing.assert_allclose(pool().pose[k, :3], 1e3 * tip.xpos, atol=1e-3)
         np.testing.assert_allclose(pool().pose[k, 3:], angles, atol=1e-3)
-        np.testing.assert_allclose(pool().spring_m[k], spring_lengths(data, 9), atol=1e-6)
+        np.testing.assert_allclose(pool().spring_m[k], spring_lengths(data, 9, 9), atol=1e-6)
 
 
 def test_even_poses_fill_more_of_the_volume_and_its_rim_than_those_of_the_training():

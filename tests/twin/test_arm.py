@@ -170,7 +170,7 @@ def test_readings_are_counts_of_the_reference_clock(noiseless):
 
 def test_springs_have_their_own_calibration(spec, noiseless):
     """The true beta and delta give the spring's length; the nominal ones are millimetres off."""
-    readings, true_m = noiseless.read_sensors(), spring_lengths(noiseless._data, 9)
+    readings, true_m = noiseless.read_sensors(), spring_lengths(noiseless._data, 9, 9)
     calibrated = noiseless._parts.sensor.lengths(readings).length_m
     nominal = spec.spring_sensor.lengths(readings).length_m
     np.testing.assert_allclose(calibrated, true_m, atol=3e-8)  # half a count is 1e-8 m
@@ -199,7 +199,7 @@ def test_springs_reach_their_references_from_any_side(spec):
     for start_kpa in (-14.0, 4.0):
         hold_pressures(arm, np.full(9, start_kpa), 3.0)
         hold_springs(arm, reference_m, np.full(9, start_kpa), gains, 9.0, arm._parts.sensor)
-        np.testing.assert_allclose(spring_lengths(arm._data, 9), reference_m, atol=3e-4)
+        np.testing.assert_allclose(spring_lengths(arm._data, 9, 9), reference_m, atol=3e-4)
         tips_m.append(np.mean([arm.motion_capture().tip_m for _ in range(50)], axis=0))
     assert np.linalg.norm(tips_m[0] - tips_m[1]) < 2e-3
 

@@ -277,7 +277,8 @@ def _dampers(arm: MovingArm, rate: Array) -> tuple[Array, Array]:
     )
     n_sections, n_chambers = len(rate), len(arm.params.area)
     friction = friction_damping(arm.own.friction_n, rate[:, : n_chambers // n_sections])
-    damping = joined(of_tendons[:n_chambers], of_tendons[n_chambers:], n_sections)
+    n_both = n_chambers + len(arm.params.spring_rest_m)
+    damping = joined(of_tendons[:n_chambers], of_tendons[n_chambers:n_both], n_sections)
     damping = jnp.broadcast_to(damping, rate.shape)
     return damping.at[:, : friction.shape[1]].add(friction), of_joints
 

@@ -129,7 +129,8 @@ def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mj
     data, params = mjx.tendon(model, data), arm.params
     area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
     volume = pneumatics.volume_m3(chamber_lengths(data, len(params.area)), *area, params.free_length_m)
-    return data, spring_lengths(data, len(params.area)), arm.own.actuators.felt(volume)
+    spring_m = spring_lengths(data, len(params.area), len(params.spring_rest_m))
+    return data, spring_m, arm.own.actuators.felt(volume)
 
 
 def _with_friction(arm: MovingArm, model: mjx.Model, data: mjx.Data) -> mjx.Model:

@@ -14,6 +14,7 @@ from mjx_softarm.control import allocation
 from mjx_softarm.mechanics import excitation
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.spec import BONDS
 from tests.arms import OTHER_ARMS
 from tests.calib.fit.planted import (
     SPEC,
@@ -39,8 +40,8 @@ MOUNTING = {
 
 @pytest.fixture(scope="module")
 def mounted():
-    """The planted arm, with bonded chambers, a tilted base, rolled sections and skew axes of the tip."""
-    return planted().replace(mounting=MOUNTING, chambers={"bonded_share": 0.5})
+    """The planted arm, bonded everywhere, with a tilted base, rolled sections and skew axes of the tip."""
+    return planted().replace(mounting=MOUNTING, chambers={"bonded_share": 1.0})
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def test_planted_numbers_come_back(fitted, mounted):
     assert offset_m < 1e-3  # of offsets up to 5 mm
     bending = fitted.spec.backbone.bending_stiffness_nm_per_rad
     assert bending == pytest.approx(mounted.backbone.bending_stiffness_nm_per_rad, rel=0.05)
-    assert fitted.spec.chambers.bonded_share == pytest.approx(0.5, abs=0.05)
+    assert fitted.spec.chambers.bonded_share == pytest.approx(1.0, abs=0.05)
     assert fitted.warnings == fitted.weak == ()
 
 
@@ -151,6 +152,18 @@ def test_what_bending_alone_does_to_an_arm_leaves_straight_poses_their_weight():
     assert fits[0].scale[0, 1] > 5.0 * fits[0].scale[1, 1]
     width = [fit.half_width_95["tip_turn_deg"][2] for fit in fits]
     assert width[0] < 0.5 * width[1]
+
+
+def test_a_bond_at_its_bound_is_said_to_be_a_wrong_weight():
+    """An arm four times as heavy as specified bends its links less evenly than free chambers do."""
+    arm = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
+    spec = arm.replace(mass={"arm_kg": arm.mass.arm_kg / 4, "gripper_kg": arm.mass.gripper_kg / 4})
+    pressure_kpa = excitation.random_pressures(arm, 100, np.random.default_rng(0))
+    fit = calibrate_chambers(pose_log(arm, 100, 0, pressure_kpa), spec)
+    assert fit.spec.chambers.bonded_share == BONDS[0]
+    said = " ".join(fit.warnings)
+    assert "bonded_share is at its bound, -0.3: the links of a section bend less evenly" in said
+    assert "did not converge" not in said
 
 
 def test_an_arm_of_two_sections_is_calibrated():

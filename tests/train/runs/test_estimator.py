@@ -50,7 +50,9 @@ def test_tips_are_those_of_c_mujoco(distilled, pool):
     for k in range(0, N_ARMS, 4):
         data.qpos[:] = pool.q[k]
         mujoco.mj_forward(model, data)
-        frame = estimate_frame(distilled.estimator, spring_lengths(data, SPEC.n_chambers), 0.0)
+        frame = estimate_frame(
+            distilled.estimator, spring_lengths(data, SPEC.n_chambers, SPEC.n_springs), 0.0
+        )
         away_mm.append(1e3 * np.linalg.norm(frame.position_m - data.site("tip").xpos))
     assert np.median(away_mm) < 1.5 and max(away_mm) < 10.0  # 0.6 and 2.2 mm after all of the training
     assert np.median(away_mm) == pytest.approx(distilled.errors["tip_mm"][0.0].median, rel=0.25)
