@@ -76,7 +76,7 @@ def drive(command, arm, **kwargs):
     if command == "run":
         run = go(arm, goals=GOALS[:1], duration_s=0.6, tell=tell, save=saved.append)
         return run.ending, run.log, saved
-    recording = record(arm, SPEC, TARGETS_KPA, True, tell, saved.append)
+    recording = record(arm, SPEC, TARGETS_KPA, tell, saved.append)
     return recording.ending, recording.log, saved
 
 
