@@ -20,7 +20,7 @@ from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
-from calib.fit.motion.actuators import ArmLag, fit_actuators
+from calib.fit.motion.actuators import MEASURED, ArmLag, fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
@@ -111,7 +111,7 @@ def chambers(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
 def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
     """Fit pumps or regulators to commanded and measured pressures, or to commands and springs."""
     spec = arm.spec
-    tracks, lag = find_tracks(measurements.logs, spec), None
+    tracks, lag = find_tracks(measurements.logs, spec), MEASURED
     if not tracks and (resting_kpa := _pressures_by_springs(measurements, spec, seed)):
         # No pressure was measured: the springs are the gauge, and the shape shows the arm's own lag
         tracks = find_tracks(measurements.logs, spec, resting_kpa)

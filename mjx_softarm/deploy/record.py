@@ -37,6 +37,9 @@ UNSEEN_POSES = 3  # poses in a row without a frame of motion capture after which
 # small to swing the arm; by hand
 STEP_SHARE = 1 / 6
 MIN_POSES = 40  # least number of poses of a recording that ends by itself
+# Greatest number: no pressure is written meanwhile. 200 poses take 15 ms, 500 would take 170 ms, and ten
+# times as long on a small computer, whose silence of 1 s makes the firmware vent.
+MOST_POSES = 200
 CHECK_POSES = 10  # poses between two checks whether more bring something; two in a row have to agree
 ENOUGH = 0.95  # ratio of the errors by all poses and by half of them from which more poses bring nothing
 LENGTHS = np.geomspace(
@@ -97,9 +100,9 @@ def record(
             # Predict each tip from the other poses; end where more poses bring nothing.
             if rest[-1] and np.isfinite(pose := hold.pose(drive)).all():
                 poses.append(pose)
-            if len(poses) >= MIN_POSES and len(poses) % CHECK_POSES == 0:
-                half_mm, error_mm = prediction_errors_mm(np.array(poses), spec)
-                n_enough = n_enough + 1 if error_mm > ENOUGH * half_mm else 0
+                if MIN_POSES <= len(poses) <= MOST_POSES and len(poses) % CHECK_POSES == 0:
+                    half_mm, error_mm = prediction_errors_mm(np.array(poses), spec)
+                    n_enough = n_enough + 1 if error_mm > ENOUGH * half_mm else 0
 
             # Report the progress.
             now_s = time.monotonic()

@@ -42,7 +42,7 @@ from mjx_softarm.twin.rod import Rod, RodParts
 
 ELEMENTS_PER_SECTION = 6  # tip within 0.2 mm of that with twelve elements
 AIR_STEPS = 4  # time steps of the chambers' air in a control period
-# Bounds of a rod's regulators, about as in the public logs of a real arm, see `benchmarks regulators`. Rates
+# Bounds of a rod's regulators, about as in the public logs of ASU-RISE-Lab/4-chamber-softarm-control. Rates
 # and deadband are in proportion to the arm's range of pressures. Lag and rates hold for a chamber of constant
 # length. A chamber expands as it fills: the pressures of the paper's arm change half as fast.
 LAG_S, DEAD_TIME_S = (0.15, 0.6), (0.05, 0.25)

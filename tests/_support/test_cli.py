@@ -106,7 +106,7 @@ def test_functions_of_two_words_get_lists_and_flags():
 
 
 @pytest.mark.parametrize(
-    "words, told",
+    "words, printed",
     [
         ("make --inner.gama 1", "--inner.gama, 1|--inner.gamma FLOAT"),
         ("make --n one", "--n: |'one'|--n INT"),
@@ -123,12 +123,12 @@ def test_functions_of_two_words_get_lists_and_flags():
         ("fail --how gone", "error: [Errno 32] gone"),  # of an arm's connection, not of the output
     ],
 )
-def test_a_mistake_is_told_with_what_it_may_be_and_status_2(words, told, capsys, monkeypatch):
+def test_a_mistake_is_printed_with_what_it_may_be_and_status_2(words, printed, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # no message is broken into lines
     assert run(*words.split()) == 2 and RESULTS == []
     out, err = capsys.readouterr()
-    assert out == "" and all(part in err for part in told.split("|"))
-    assert not told.startswith("error") or err.count("\n") == 1
+    assert out == "" and all(part in err for part in printed.split("|"))
+    assert not printed.startswith("error") or err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -61,17 +61,15 @@ TOLERANCES: dict[str, Any] = {"max_nfev": 60, "ftol": 1e-6, "xtol": 1e-3, "gtol"
 # Standard deviation of the logarithms of lag and dead time by the springs, beside that of the fit: the arm is
 # more than some lags. Planted lags of 0.5 and 0.8 s of rods came out 1 % above and 4 % below.
 BY_SPRINGS = 0.05
-MISFIT, SMALL_MISFIT_KPA = (
-    4.0,
-    0.15,
-)  # error, in the noise of the pressures and at least, of another kind of actuator
+# Error from which the actuators are of another kind: in the noise of the pressures, and at least
+MISFIT, SMALL_MISFIT_KPA = 4.0, 0.15
 # Greatest distance of a converged fit from its minimum, in standard deviations, RMS over the parameters; dead
 # times are interpolated between ticks, and the errors have kinks there
 SMALL_STEP = 0.2
 KNOWN = 0.3  # relative half-width of an interval up to which a number counts as known
 # Ratio of errors by the springs up to which the simpler actuators are better: hysteresis of the arm looks
-# like a deadband. Regulators fitted to the paper's pumps leave 1.0 instead of 1.15 kPa, to regulators of 1.2
-# s 0.3 of 0.6.
+# like a deadband. On the paper's pumps regulators leave 1.0 kPa where pumps leave 1.15, on regulators of 1.2
+# s 0.3 where pumps leave 0.6.
 MARGIN_BY_SPRINGS = 1.2
 MARGIN, SMALL_KPA = 1.05, 0.1  # ratio and difference of errors up to which the simpler actuators are better
 MAX_RATIO = 2.0  # ratio of held-out to other errors from which there is a warning
@@ -100,7 +98,7 @@ class ArmLag(NamedTuple):
 
     @classmethod
     def of_shape(cls, lag_s: float, log_std: float) -> ArmLag:
-        """Return the lag as the shape's lag, and the standard deviation of its logarithm, let expect it."""
+        """Return the lag to expect from the shape's lag [s] and the standard deviation of its logarithm."""
         return cls(OF_SHAPE * lag_s, float(np.hypot(OF_SHAPE_PRIOR, log_std)))
 
 
@@ -126,7 +124,7 @@ class ActuatorFit:
 
 
 def fit_actuators(
-    tracks: Sequence[Track], spec: ArmSpec, seed: int = 0, arm: ArmLag | None = None
+    tracks: Sequence[Track], spec: ArmSpec, seed: int = 0, arm: ArmLag = MEASURED
 ) -> ActuatorFit:
     """Fit regulators, and the flow of pumps; keep those that are better on held-out seconds.
 
@@ -134,10 +132,10 @@ def fit_actuators(
         tracks: parts of logs from `find_tracks`, one or more.
         spec: arm, its chambers already calibrated.
         seed: seed that chooses the held-out seconds.
-        arm: lag that the arm is expected to have, of tracks with pressures by the springs; None for measured
-            ones.
+        arm: lag that the arm is expected to have, of tracks with pressures by the springs; `MEASURED` for
+            measured ones.
     """
-    by_springs, arm, c = arm is not None, arm or MEASURED, spec.n_chambers
+    by_springs, c = arm is not MEASURED, spec.n_chambers
     n_sections = spec.structure.n_sections
     runs = Runs(tracks, 1.0 / spec.control.rate_hz, n_sections if by_springs else None)
     held_out = np.repeat(held_out_blocks(runs.n_seconds, BLOCK_S, seed), c)

@@ -124,7 +124,7 @@ def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
     assert section.notes == fit.notes and "The regulator is kept" in section.text
 
 
-def test_a_stiff_regulator_is_told_from_one_that_the_volume_pulls(short):
+def test_a_stiff_regulator_is_distinguished_from_one_that_the_volume_pulls(short):
     """Its lag comes out as planted, where the other model would need 0.4 s."""
     plant = dataclasses.replace(REGULATOR, lag_s=0.8, volume_share=0.0)
     fit = fit_actuators(find_tracks([log_of(short, plant)], short), short)
