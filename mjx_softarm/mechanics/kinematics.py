@@ -1,9 +1,11 @@
 """Poses of the plates and of the joints, from MJX or from the closed-form chain.
 
 The arm is a chain of links. Each link joins a plate to the next one by a slide along the
-parent plate's -z (positive = extension) and two perpendicular hinges, x then y, half a link below;
-joint coordinates are `q (3 * n_links,)`, ordered (slide [m], hinge x [rad], hinge y [rad]) link by link.
-Both engines return the same `Frames`; everything downstream is shared.
+parent plate's -z (positive = extension) and two perpendicular hinges half a link below. The first link
+turns about x and then y, the next one about y and then x, and so on: in the same order, the hinges' small
+twists would add up, and an arm bent sideways would turn about its length.
+Joint coordinates are `q (3 * n_links,)`, ordered (slide [m], first hinge [rad], second hinge [rad]) link
+by link. Both engines return the same `Frames`; everything downstream is shared.
 
 Many arms come last in every shape, (..., *arms): one instruction then serves several arms. For one arm,
 *arms is empty. A number that all arms share may have a 1 in their place.
@@ -32,7 +34,7 @@ class Frames(NamedTuple):
 
     plate_position: Array  # (n_links + 1, 3, *arms) [m], the first is the base
     plate_rotation: Array  # (n_links + 1, 3, 3, *arms), columns are the plate's axes
-    axis: Array  # (n_links, 3 dofs, 3, *arms), unit vectors: slide, hinge x, hinge y
+    axis: Array  # (n_links, 3 dofs, 3, *arms), unit vectors: slide, first and second hinge
     anchor: Array  # (n_links, 3, *arms) [m], the point both hinges turn about
     tip_position: Array  # (3, *arms) [m]
     tip_rotation: Array  # (3, 3, *arms)
@@ -57,9 +59,10 @@ class ChainKinematics:
             return jnp.broadcast_to(x, (*shape, *arms))
 
         # Rotations of the plates: each link turns the plate above it
-        slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
+        slide, first, second = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
+        y_first = np.arange(len(slide)).reshape(-1, *[1] * len(arms)) % 2 == 1
         base = of_arms(self.mount.base_rotation, 3, 3)
-        local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3, *arms)
+        local = _rotation(first, second, y_first)  # (L, 3, 3, *arms)
         chained = jax.lax.associative_scan(products, local)
         rotation = jax.vmap(product, in_axes=(None, 0))(base, chained)
         plate_rotation = jnp.concatenate([base[None], rotation])
@@ -73,9 +76,11 @@ class ChainKinematics:
         plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
 
         # Axes of the joints: the second hinge turns with the first
-        cos, sin = jnp.cos(bend_x)[:, None], jnp.sin(bend_x)[:, None]
-        axis_y = cos * parent[:, :, 1] + sin * parent[:, :, 2]
-        axis = jnp.stack([-parent[:, :, 2], parent[:, :, 0], axis_y], axis=1)
+        x, y, z = jnp.moveaxis(parent, 2, 0)  # (L, 3, *arms) each
+        swapped = y_first[:, None]
+        cos, sin = jnp.cos(first)[:, None], jnp.sin(first)[:, None]
+        axis_2 = cos * jnp.where(swapped, x, y) + jnp.where(swapped, -sin, sin) * z
+        axis = jnp.stack([-z, jnp.where(swapped, y, x), axis_2], axis=1)
         last = plate_rotation[-1]
         return Frames(
             plate_position,
@@ -120,9 +125,13 @@ def frames_of(model: mjx.Model, data: mjx.Data) -> Frames:
     )
 
 
-def _rotation_xy(x: Array, y: Array) -> Array:
-    """Return Rx(x) Ry(y), (L, 3, 3, *arms)."""
-    cx, sx, cy, sy = jnp.cos(x), jnp.sin(x), jnp.cos(y), jnp.sin(y)
-    zero = jnp.zeros_like(x)
-    rows = [[cy, zero, sy], [sx * sy, cx, -sx * cy], [-cx * sy, sx, cx * cy]]
+def _rotation(first: Array, second: Array, y_first: np.ndarray) -> Array:
+    """Return Rx(first) Ry(second), or Ry(first) Rx(second) where `y_first`, (L, 3, 3, *arms)."""
+    c1, s1, c2, s2 = jnp.cos(first), jnp.sin(first), jnp.cos(second), jnp.sin(second)
+    zero = jnp.zeros_like(first)
+    xy = [[c2, zero, s2], [s1 * s2, c1, -s1 * c2], [-c1 * s2, s1, c1 * c2]]
+    yx = [[c1, s1 * s2, s1 * c2], [zero, c2, -s2], [-s1, c1 * s2, c1 * c2]]
+    rows = [
+        [jnp.where(y_first, b, a) for a, b in zip(*both, strict=True)] for both in zip(xy, yx, strict=True)
+    ]
     return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)

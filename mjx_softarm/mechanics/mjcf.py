@@ -116,7 +116,7 @@ def episode_model(model: mjx.Model, params: ArmParams) -> mjx.Model:
 
 
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
-    """Add one link: a slide along the parent plate's -z, then hinges x and y half a link below it."""
+    """Add one link: a slide along the parent plate's -z, then two hinges half a link below it."""
     # Body and its inertia, that of a solid cylinder about its centre
     per_section = spec.structure.links_per_section
     section = link // per_section
@@ -134,12 +134,11 @@ def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     # Joints: a section's backbone is `links_per_section` links in series
     axial = spec.per_section(spec.backbone.axial_damping_ns_per_m)[section]
     bending = spec.per_section(spec.backbone.bending_damping_nms_per_rad)[section]
-    joints = (
-        ("slide", mujoco.mjtJoint.mjJNT_SLIDE, [0.0, 0.0, -1.0], axial),
-        ("bend_x", mujoco.mjtJoint.mjJNT_HINGE, [1.0, 0.0, 0.0], bending),
-        ("bend_y", mujoco.mjtJoint.mjJNT_HINGE, [0.0, 1.0, 0.0], bending),
-    )
-    for k, (name, kind, axis, damping) in enumerate(joints):
+    slide = ("slide", mujoco.mjtJoint.mjJNT_SLIDE, [0.0, 0.0, -1.0], axial)
+    bend_x = ("bend_x", mujoco.mjtJoint.mjJNT_HINGE, [1.0, 0.0, 0.0], bending)
+    bend_y = ("bend_y", mujoco.mjtJoint.mjJNT_HINGE, [0.0, 1.0, 0.0], bending)
+    hinges = (bend_y, bend_x) if link % 2 else (bend_x, bend_y)  # the order of `mechanics.kinematics`
+    for k, (name, kind, axis, damping) in enumerate((slide, *hinges)):
         joint = body.add_joint(name=f"{name}{link}", type=kind, axis=axis)
         joint.stiffness = _polynomial(float(params.joint_stiffness[3 * link + k]))
         joint.damping = _polynomial(damping * per_section)

@@ -46,7 +46,8 @@ def mujoco_frames(model, q):
     mujoco.mj_kinematics(model, data)
     n_links = len(q) // 3
     rings = [data.geom(f"ring{k}") for k in range(n_links + 1)]
-    joints = [[data.joint(f"{kind}{k}") for kind in ("slide", "bend_x", "bend_y")] for k in range(n_links)]
+    kinds = ("slide", "bend_x", "bend_y"), ("slide", "bend_y", "bend_x")  # y comes first in each second link
+    joints = [[data.joint(f"{kind}{k}") for kind in kinds[k % 2]] for k in range(n_links)]
     return Frames(
         plate_position=np.array([ring.xpos for ring in rings]),
         plate_rotation=np.array([ring.xmat.reshape(3, 3) for ring in rings]),

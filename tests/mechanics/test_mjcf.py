@@ -54,9 +54,9 @@ def test_one_section_bends_by_the_paper_s_95_deg_and_no_further():
     assert max(angle, key=angle.get) in set(itertools.permutations(one_pushes))
     assert max(angle.values()) == pytest.approx(95.0, abs=5.0)
     assert angle[two_push] < angle[one_pushes]
-    for pattern in (one_pushes, two_push):  # no direction is special but for the hinges' order, x before y
+    for pattern in (one_pushes, two_push):  # no direction is special but for the hinges' order
         turned = [angle[p] for p in set(itertools.permutations(pattern))]
-        assert max(turned) - min(turned) < 1.0
+        assert max(turned) - min(turned) < 1.2
 
 
 def test_springs_and_pressure_limits(model):

@@ -213,7 +213,7 @@ IMPOSSIBLE = {
         "backbone": {"axial_stiffness_n_per_m": 1.0, "bending_stiffness_nm_per_rad": 0.01},
     },
     "chambers that buckle the backbone": {"backbone": {"bending_stiffness_nm_per_rad": 1e-3}},
-    "pistons of a tenth of a square metre": {"chambers": {"area_m2": 0.1}},
+    "pistons of three square decimetres": {"chambers": {"area_m2": 0.03}},
 }
 
 

@@ -117,7 +117,9 @@ def test_bonds_resist_links_that_are_unlike_each_other_and_no_others(share):
     bonded, links = odd_arm(share=share), 4
     free, pressure = odd_arm(share=0.0), np.zeros(9)
     unlike, _ = random_state(bonded, 5)
-    alike = np.tile(unlike.reshape(3, 4, 3)[:, :1], (1, 4, 1)).ravel()
+    alike = np.tile(unlike.reshape(3, 4, 3)[:, :1] * [1, 1, 0], (1, 4, 1))
+    alike[:, 1::2] = alike[:, 1::2, [0, 2, 1]]  # hinge x is the second one of each second link
+    alike = alike.ravel()
     for q in (alike, unlike):
         data = mujoco_at(bonded, q, pressure)
         model, jacobian = compiled(bonded)[0], np.zeros((18 + 9 * links, len(q)))
