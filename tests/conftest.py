@@ -13,10 +13,11 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import ArmModel
-from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
+from mjx_softarm.sensing.estimator import SpringModel
 from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
 from tests.arms import FOUR_CHAMBERS, OTHER_ARMS
+from tests.linear_arm import even_estimator
 from tests.networks import s2r_of
 
 jax.config.update("jax_num_cpu_devices", 8)  # most tests use one of them
@@ -111,9 +112,9 @@ def make_arm_model():
 
         angle = np.pi / 2 + 2 * np.pi * np.arange(n).reshape(n_sections, -1) / spec.springs_per_section
         site_m = np.float32(0.067 * np.stack([np.cos(angle), np.sin(angle)], -1))
-        n_in, n_changes, kg = n + 3 * n_sections, N_CHANGES * n_sections, np.float32([0.0, 1.0])
-        networks = layers(n_in, 4, n_changes), layers(n_in + 1, 4, n_changes)
-        estimator = PoseEstimator(*networks, site_m, row(0.18), row(0.05), *kg, row(1e-3, 6))
+        kg, estimator = np.float32([0.0, 1.0]), even_estimator(site_m)
+        coefficient = 1e-3 * rng.normal(size=estimator.coefficient.shape)
+        estimator = estimator._replace(coefficient=np.float32(coefficient))
         scaling, kpa = (row(0.18), row(0.05)), (row(-10.0, spec.n_chambers), row(30.0, spec.n_chambers))
         n_out, blocks = 2 * spec.n_chambers + n_sections, (n_sections, spec.n_chambers // n_sections)
         plane = np.float32(0.1 * rng.normal(size=(n, n_out))), *scaling, row(-4.0, n_out), row(1.0, n_out)

@@ -12,7 +12,15 @@ from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, estimate
+from mjx_softarm.sensing.estimator import (
+    N_CHANGES,
+    N_TERMS,
+    N_VARIABLES,
+    PoseEstimator,
+    SpringModel,
+    estimate,
+    polynomial_terms,
+)
 from mjx_softarm.sensing.load import COMMON_FACTOR, LoadEstimator
 
 SPEC = ArmSpec.default()
@@ -21,6 +29,8 @@ SENSOR = SPEC.spring_sensor
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
 REST_M = 0.2
 NOISE_M = 4e-5
+VARIABLE_RANGE = 10.0  # of the estimator: nothing is beyond it
+LENGTH, LOAD = 0, N_VARIABLES - 1  # places of two of its variables
 LAG = 0.15  # of the way to the commanded pressure, per tick
 
 
@@ -123,26 +133,49 @@ def load_estimator_of(spec, effect_kpa_per_kg, sd_kg=0.05):
     return LoadEstimator(layers, **{name: np.float32(value) for name, value in fields.items()})
 
 
+def even_estimator(site_m):
+    """An estimator of sections that bend evenly, with springs in holes (n_sections, s, 2) [m]."""
+    n_sections = len(site_m)
+    fields = {
+        "coefficient": np.zeros((n_sections, N_TERMS, N_CHANGES)),
+        "variable_centre": np.zeros((n_sections, N_VARIABLES)),
+        "variable_scale": np.full((n_sections, N_VARIABLES), VARIABLE_RANGE),
+        "spring_site_m": site_m,
+        "section_mass_kg": np.full(n_sections, 0.1),
+        "gripper_mass_kg": 0.1,
+        "tool_offset_m": np.array([0.05, 0.1]),
+        "base_position_m": np.zeros(3),
+        "base_rotation": np.eye(3),
+        "tip_offset_m": np.zeros(3),
+        "tip_rotation": np.eye(3),
+    }
+    return PoseEstimator(**{name: np.asarray(value, np.float32) for name, value in fields.items()})
+
+
+def changed(estimator, change, factors=(), sections=slice(None)):
+    """The estimator whose sections' ends change (N_CHANGES,) for each product of 1 of these variables."""
+    coefficient = estimator.coefficient.copy()
+    coefficient[sections, term(*factors)] += np.multiply(change, VARIABLE_RANGE ** len(factors))
+    return estimator._replace(coefficient=coefficient.astype(estimator.coefficient.dtype))
+
+
+def term(*factors):
+    """The place of a product of variables in the polynomial: primes have one product of a size."""
+    primes = np.array([2.0, 3, 5, 7, 11, 13, 17, 19, 23, 29])
+    [place] = np.flatnonzero(polynomial_terms(primes) == np.prod(primes[list(factors)]))
+    return place
+
+
 def make_policy(spec=SPEC):
     """A policy whose estimator and spring model are exact for the linear arm; its actor is not looked at."""
     n, n_sections = spec.n_springs, spec.structure.n_sections
     springs, chambers = np.zeros(n, np.float32), np.zeros(spec.n_chambers, np.float32)
     rest_m, gain = spec.at_springs(spec.geometry.section_length_m), gain_of(spec)
-    n_in, n_out = n + 3 * n_sections, 6 * n_sections
     first_rad = np.radians(spec.per_section(spec.geometry.first_chamber_deg))
     angle = first_rad[:, None] + 2 * np.pi * np.arange(n // n_sections) * n_sections / n
     radius_m = np.array(spec.per_section(spec.geometry.spring_radius_m))
     site_m = radius_m[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    network = PoseEstimator(
-        layers=((np.zeros((n_in, n_out), np.float32), np.zeros(n_out, np.float32)),),
-        load_layers=((np.zeros((n_in + 1, n_out), np.float32), np.zeros(n_out, np.float32)),),
-        spring_site_m=site_m.astype(np.float32),
-        spring_centre_m=springs,
-        spring_scale_m=springs + 1,
-        load_centre_kg=np.float32(0.0),
-        load_scale_kg=np.float32(1.0),
-        change_scale=np.ones(6, np.float32),
-    )
+    network = even_estimator(site_m)
     load = load_estimator_of(spec, np.full(spec.n_chambers, 1e5))  # no pressure counts as a payload
     model = SpringModel(
         layers=((gain.T.astype(np.float32), springs),),
@@ -174,12 +207,10 @@ def moves_aside(policy, aside_m=0.5):
 
     A payload of 1 kg doubles it.
     """
-    (weights, bias), *_ = policy.estimator.layers
-    (load_weights, load_bias), *_ = policy.estimator.load_layers
-    by_springs, by_load = np.zeros_like(weights), np.zeros_like(load_weights)
-    by_springs[N - 1, -6] = by_load[N - 1, -6] = aside_m  # x of the last section's end [m/m], and per kg
-    layers = {"layers": ((by_springs, bias),), "load_layers": ((by_load, load_bias),)}
-    return dataclasses.replace(policy, estimator=policy.estimator._replace(**layers))
+    aside = np.array([3.0 * aside_m, 0, 0, 0, 0, 0])  # its section is a third of that longer
+    estimator = changed(policy.estimator, aside, (LENGTH,), sections=slice(-1, None))
+    estimator = changed(estimator, aside, (LENGTH, LOAD), sections=slice(-1, None))
+    return dataclasses.replace(policy, estimator=estimator)
 
 
 POLICY = make_policy()

@@ -7,7 +7,7 @@ ingredient, and what this changes is that ingredient's part:
         policy                     law              payload                   springs                 models
 
 The last step is the error of the pose's models and of all that they do not know. It is divided by the squares
-of the models' held-out errors, which the policy file has: estimator, S2R, and the rest, such as hysteresis.
+of the models' held-out errors, which the policy file has: S2R, and the rest, such as hysteresis.
 Where nobody says what hangs at the gripper, the loop's estimate of the payload counts as the true payload.
 
 The part of an ingredient is the component of its step along the tip's error: parts add up to the error, and
@@ -117,7 +117,6 @@ def _remedies(parts: Budget) -> dict[str, str]:
         else f"{off} although no chamber is saturated: look for a leak or a slow regulator",
         "payload": f"the loop believes {parts.believed_g:.0f} g, and --payload says {hung_g:.0f} g: {more}",
         "springs": f"zeros have shifted since the calibration, about [mm]: {zeros}: {again}",
-        "estimator": "the distilled pose is this far off its simulation; no recording changes that",
         "S2R": f"as large as at the calibration's held-out poses: {more}",
         # `--since` fits the springs' zeros, which explain the part `springs` alone.
         "rest": "the policy does not know this arm: calibrate it and train (docs/your-arm.md)"
@@ -158,17 +157,16 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float | None) -> Bu
     # The models' error, with the part that shifted zeros explain. Where it is no larger than at the
     # calibration, none have shifted. With a payload it is not theirs alone: the models learned without one.
     # Models that are far off misread the payload, too
-    known = {"estimator": _estimator_mm(policy, float(true_kg.mean())), "S2R": _s2r_mm(policy)}
-    known_mm = float(np.hypot(known["estimator"], known["S2R"]))
-    wrong_mm = max(1e3 * WRONG_SHARE * policy.spec.length_m, WRONG_RATIO * known_mm)
+    s2r_mm = 0.0 if policy.s2r is None else float(policy.s2r.error_mm)
+    wrong_mm = max(1e3 * WRONG_SHARE * policy.spec.length_m, WRONG_RATIO * s2r_mm)
     left = pose_error(seen, off[-1])
     left_mm = np.linalg.norm(left[:, :3], axis=1).mean()
     mass = policy.spec.mass
     loaded = float(true_kg.mean()) - mass.payload_kg > LIGHT * mass.largest_payload_kg
     loaded &= payload_kg is not None or bool(left_mm < wrong_mm)
     shift_m, by_shift = np.zeros(spring_m.shape[1]), np.zeros_like(left)
-    if not loaded and known["S2R"] and left_mm > AS_CALIBRATED * known_mm:
-        shift_m, by_shift = _shift(policy, spring_m, left, true_kg, known_mm)
+    if not loaded and s2r_mm and left_mm > AS_CALIBRATED * s2r_mm:
+        shift_m, by_shift = _shift(policy, spring_m, left, true_kg, s2r_mm)
     each = steps[..., :3] * policy.reward.asked[:3]
     by_shift = by_shift[:, :3] * policy.reward.asked[:3]
     each = np.concatenate([each[:, :3], by_shift[:, None], each[:, 3:] - by_shift[:, None]], axis=1)
@@ -176,12 +174,12 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float | None) -> Bu
     along = error / np.maximum(np.linalg.norm(error, axis=1), 1e-9)[:, None]
     *parts, models = (float(x) for x in np.einsum("pki,pi->pk", each, along).mean(axis=0))
 
-    # The models' part, divided by their held-out errors
-    size = max(float(np.mean(np.linalg.norm(each[:, -1], axis=1) ** 2)), known_mm**2)
-    shares = {name: models * value**2 / max(size, 1e-12) for name, value in known.items()}
+    # The models' part, of which S2R has as much as at held-out poses
+    size = max(float(np.mean(np.linalg.norm(each[:, -1], axis=1) ** 2)), s2r_mm**2)
     named = dict(zip(("policy", "law", "payload", "springs"), parts, strict=True))
+    named["S2R"] = models * s2r_mm**2 / max(size, 1e-12)
     return Budget(
-        parts_mm=named | shares | {"rest": models - sum(shares.values())},
+        parts_mm=named | {"rest": models - named["S2R"]},
         shift_mm=1e3 * shift_m,
         believed_g=1e3 * float(load_kg.mean()),
         payload_g=None if payload_kg is None else 1e3 * payload_kg,
@@ -192,18 +190,6 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float | None) -> Bu
         wrong_mm=wrong_mm,
         calibrated=policy.calibrated,
     )
-
-
-def _estimator_mm(policy: Policy, payload_kg: float) -> float:
-    """Return the estimator's median error on held-out simulated arms with the nearest payload; 0: unknown."""
-    table = policy.provenance.get("estimator_errors", {}).get("tip_mm", {})
-    own_kg = payload_kg - policy.spec.mass.payload_kg
-    name = min(table, key=lambda text: abs(float(text.split()[0]) - own_kg), default=None)
-    return 0.0 if name is None else float(table[name]["median"])
-
-
-def _s2r_mm(policy: Policy) -> float:
-    return 0.0 if policy.s2r is None else float(policy.s2r.error_mm)
 
 
 def _shift(

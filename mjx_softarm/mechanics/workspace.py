@@ -43,6 +43,7 @@ class LoadedPool(NamedTuple):
     """Equilibria of arms with payloads, whose chambers differ a little from the nominal arm's; float32."""
 
     load_kg: np.ndarray  # (n,) payload
+    q: Array  # (n, nv) [m, rad, rad]
     pressure_kpa: Array  # (n, n_chambers)
     spring_m: Array  # (n, n_springs)
     pose: Array  # (n, 6) [mm, deg]
@@ -134,7 +135,7 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     equilibria = _in_batches(solver, spec, pressure_kpa, load_kg, *factors)
     rows = _chosen(spec, equilibria, equilibria.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
     pool = _pool(equilibria, rows)
-    return LoadedPool(load_kg[rows].astype(np.float32), pool.pressure_kpa, pool.spring_m, pool.pose)
+    return LoadedPool(load_kg[rows].astype(np.float32), *pool)
 
 
 def sample_evenly(spec: ArmSpec, n: int, seed: Seed) -> Pool:

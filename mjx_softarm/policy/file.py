@@ -59,7 +59,7 @@ from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, Mounting, SpecError
 
-SCHEMA_VERSION = 16
+SCHEMA_VERSION = 17
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it

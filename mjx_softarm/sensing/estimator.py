@@ -2,9 +2,10 @@
 
 No sensor of the arm sees the tip. Three or more springs give a section's length and bend, a section of
 constant curvature has a closed form, and the sections are in series. Real sections do not bend evenly, since
-the weight below pulls at them. So a small network, distilled from the simulator, corrects each section's end.
-Its inputs are the springs and the direction of gravity at each section's end. A second network also has the
-payload as input (`mjx_softarm.sensing.load`); its output is multiplied by the payload.
+the weight below pulls at them. That moves and turns a section's end by a smooth function of the section's
+length and bend, of the direction of gravity, and of the masses below: a polynomial for each section, fitted
+to the simulator. The masses' place depends on the sections below, and their change on the sections above. So
+several passes are made, the first one with masses on sections of constant curvature.
 
 In the other direction, `expected_springs` predicts the spring lengths at given pressures without a payload.
 The control loop compares them with the readings to find a chamber that has lost its pressure.
@@ -27,23 +28,32 @@ from mjx_softarm.sensing.pose import (
 )
 
 N_CHANGES = 6  # change of a section's end: position [m], Gibbs vector (axis times tangent of half the angle)
+N_PASSES = 2
+POSE_ERROR_MM = 0.1  # error that 95 % of poses shall not exceed; `train export` says where they do
+_COSTS = (
+    *[1] * 3,
+    *[2] * 7,
+)  # of a factor in a term of the polynomial: three of the shape, seven of the load
+_DEGREE = 7  # greatest cost of a term; with 6, turns are three times as far off
 _SMALL_BEND = 1e-8  # square of a bend [rad^2] below which a section counts as straight
 
 
 class PoseEstimator(NamedTuple):
-    """Networks from spring lengths and payload to the tip pose, for n springs. All float32."""
+    """Sections of constant curvature, and a polynomial for what each section's end is off. All float32."""
 
-    # Normalised springs (n,) and ups (3 n_sections,) -> changes (n_sections * N_CHANGES,)
-    layers: tuple[Layer, ...]
-    load_layers: tuple[Layer, ...]  # these inputs and the normalised payload (1,) -> changes per payload
+    coefficient: Array  # (n_sections, N_TERMS, N_CHANGES) [m, 1]
+    variable_centre: Array  # (n_sections, N_VARIABLES) middle of the range of each of `variables`
+    variable_scale: (
+        Array  # (n_sections, N_VARIABLES) half of it; a variable beyond its range counts as its end
+    )
     spring_site_m: Array  # (n_sections, s, 2) holes of the s springs of each section in its rings, x and y
-    spring_centre_m: Array  # (n,) lengths that are normalised to 0
-    spring_scale_m: Array  # (n,) difference of length that is normalised to 1
-    load_centre_kg: Array  # () payload that is normalised to 0
-    load_scale_kg: Array  # () difference of payload that is normalised to 1
-    change_scale: Array  # (N_CHANGES,) [m, 1] units of the networks' outputs
-    base_position_m: Array = np.zeros(3, np.float32)  # origin of the arm's own base in the base frame (z up)
-    base_rotation: Array = np.eye(3, dtype=np.float32)  # axes of the arm's own base
+    section_mass_kg: Array  # (n_sections,)
+    gripper_mass_kg: Array  # ()
+    tool_offset_m: Array  # (2,) centres of gripper and payload below the last plate
+    base_position_m: Array  # (3,) origin of the arm's own base in the base frame (z up)
+    base_rotation: Array  # (3, 3) axes of the arm's own base
+    tip_offset_m: Array  # (3,) measured tip in the frame of the last plate
+    tip_rotation: Array  # (3, 3) its axes
 
 
 class SpringModel(NamedTuple):
@@ -70,24 +80,119 @@ def estimate(estimator: PoseEstimator, spring_m: Array, load_kg: Array | float) 
 
 def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | float) -> Frame:
     """Return the tip frame of an arm at rest with springs (..., n) [m] and a payload (...) or () [kg]."""
-    # Sections of constant curvature, and inputs of the networks
+    # Sections of constant curvature
     xp = array_namespace(spring_m, estimator.spring_site_m)
     spring_m = xp.asarray(spring_m, dtype=estimator.spring_site_m.dtype)
-    even = constant_curvature(estimator.spring_site_m, spring_m)  # (..., n_sections)
-    normalised = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m
-    load = (xp.asarray(load_kg, dtype=spring_m.dtype) - estimator.load_centre_kg) / estimator.load_scale_kg
-    load = (xp.zeros_like(normalised[..., 0]) + load)[..., None]  # (..., 1)
-    shape = xp.concat([normalised, *_ups(estimator.base_rotation, even.rotation)], axis=-1)
+    length, bend = section_shapes(estimator.spring_site_m, spring_m)
+    even = sections = arcs(length, bend)
 
     # Changes of each section's end; position and Gibbs vector are continuous where yaw and roll are not
-    changes = mlp(estimator.layers, shape)
-    changes = changes + load * mlp(estimator.load_layers, xp.concat([shape, load], axis=-1))
-    changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale
-    quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
-    turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
-    tip = chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
+    load_kg = (
+        xp.zeros_like(length[..., 0, :]) + xp.asarray(load_kg, dtype=length.dtype)[..., None]
+    )  # (..., 1)
+    for _ in range(N_PASSES):
+        moments = first_moments(estimator, length, sections, load_kg)
+        up, ends = estimator.base_rotation[2] + 0.0 * moments[0], list[Frame]()
+        for k, moment in enumerate(moments):
+            x = variables(
+                length[..., k, :], bend[..., k, :], even.rotation[..., k, :, :], up, moment, load_kg
+            )
+            x = xp.clip((x - estimator.variable_centre[k]) / estimator.variable_scale[k], -1.0, 1.0)
+            change = polynomial_terms(x) @ estimator.coefficient[k]
+            quaternion = xp.concat([xp.ones_like(change[..., :1]), change[..., 3:]], axis=-1)
+            turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
+            rotation = turn @ even.rotation[..., k, :, :]
+            ends.append(Frame(even.position_m[..., k, :] + change[..., :3], rotation))
+            up = (up[..., None, :] @ rotation)[..., 0, :]
+        sections = Frame(
+            xp.concat([end.position_m[..., None, :] for end in ends], axis=-2),
+            xp.concat([end.rotation[..., None, :, :] for end in ends], axis=-3),
+        )
 
+    # From the last plate to the tip, and from the arm's own base to the base frame
+    plate = chain(sections)
+    tip_m = plate.position_m + plate.rotation @ estimator.tip_offset_m
+    tip = Frame(tip_m, plate.rotation @ estimator.tip_rotation)
     return _from_base(Frame(estimator.base_position_m, estimator.base_rotation), tip)
+
+
+def first_moments(estimator: PoseEstimator, length: Array, sections: Frame, load_kg: Array) -> list[Array]:
+    """Return the first moments (..., 3) [kg m] of the masses below each section, about its end, in its axes.
+
+    Args:
+        estimator: masses of the arm.
+        length (..., n_sections, 1) [m]: lengths of the sections.
+        sections: each section's end in the frame of its start, (..., n_sections).
+        load_kg (..., 1) [kg]: payload.
+    """
+    z = np.eye(3, dtype=length.dtype)[2]
+    mass = estimator.gripper_mass_kg + load_kg
+    moment = (
+        -(estimator.gripper_mass_kg * estimator.tool_offset_m[0] + load_kg * estimator.tool_offset_m[1]) * z
+    )
+    moments = [moment]
+    for k in reversed(range(1, length.shape[-2])):  # from the tip up
+        position_m, rotation = sections.position_m[..., k, :], sections.rotation[..., k, :, :]
+        # Centre of a cubic curve whose ends have these directions
+        centre_m = 0.5 * position_m + length[..., k, :] / 12.0 * (rotation[..., 2] - z)
+        moment = (rotation @ moment[..., None])[..., 0] + mass * position_m
+        moment = moment + estimator.section_mass_kg[k] * centre_m
+        mass = mass + estimator.section_mass_kg[k]
+        moments.append(moment)
+    return moments[::-1]
+
+
+def variables(
+    length: Array, bend: Array, even_rotation: Array, up: Array, moment: Array, load_kg: Array
+) -> Array:
+    """Return what the change of a section's end depends on, (..., N_VARIABLES).
+
+    These are its shape, the direction against gravity, the torque of gravity on the masses below, over its
+    acceleration, and the payload. No variable depends on the change itself: directions are in the axes of the
+    section's start, and the masses below turn with a section of constant curvature.
+
+    Args:
+        length, bend: of the section, (..., 1) [m] and (..., 2) [rad].
+        even_rotation (..., 3, 3): axes of its end in those of its start, of constant curvature.
+        up (..., 3): direction against gravity in the axes of the section's start.
+        moment (..., 3) [kg m]: of the masses below, see `first_moments`.
+        load_kg (..., 1) [kg]: payload.
+    """
+    moment = (even_rotation @ moment[..., None])[..., 0]
+    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
+    torque = moment[..., after] * up[..., before] - moment[..., before] * up[..., after]
+    return array_namespace(length).concat([length, bend, up, torque, load_kg], axis=-1)
+
+
+def polynomial_terms(x: Array) -> Array:
+    """Return the products (..., N_TERMS) of variables (..., N_VARIABLES) that the polynomial adds up."""
+    xp = array_namespace(x)
+    products = [xp.ones_like(x[..., :1])]
+    for parent, factor in _PRODUCTS:
+        products.append(products[-1][..., parent] * x[..., factor])
+    return xp.concat(products, axis=-1)
+
+
+def _products() -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return, for products of 1, 2, ... factors, the product of one factor less and the last factor."""
+    levels = list[tuple[np.ndarray, np.ndarray]]()
+    last = [(0, 0)]  # by product: place of its last factor, and cost
+    while True:
+        longer = [
+            (place, factor, cost + _COSTS[factor])
+            for place, (least, cost) in enumerate(last)
+            for factor in range(least, len(_COSTS))
+            if cost + _COSTS[factor] <= _DEGREE
+        ]
+        if not longer:
+            return levels
+        levels.append((np.array([item[0] for item in longer]), np.array([item[1] for item in longer])))
+        last = [item[1:] for item in longer]
+
+
+_PRODUCTS = _products()
+N_VARIABLES = len(_COSTS)
+N_TERMS = 1 + sum(len(factors) for _, factors in _PRODUCTS)
 
 
 def even_pose(base: Frame, spring_site_m: Array, spring_m: Array) -> Array:
@@ -102,24 +207,38 @@ def _from_base(base: Frame, tip: Frame) -> Frame:
 
 
 def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
-    """Return each section's end in the frame of its start, for sections of constant curvature.
+    """Return each section's end in the frame of its start, with arguments and results of the two steps."""
+    return arcs(*section_shapes(spring_site_m, spring_m))
+
+
+def section_shapes(spring_site_m: Array, spring_m: Array) -> tuple[Array, Array]:
+    """Return lengths (..., n_sections, 1) [m] and bends (..., n_sections, 2) [rad] of sections.
+
+    A section turns towards its shorter springs by |bend|. They are least squares over a section's springs.
 
     Args:
         spring_site_m (n_sections, s, 2) [m]: holes of the springs, three or more a section at equal angles.
         spring_m (..., n_sections * s) [m]: lengths.
+    """
+    xp = array_namespace(spring_m, spring_site_m)
+    spring = spring_m.reshape(*spring_m.shape[:-1], *spring_site_m.shape[:2])
+    length = xp.mean(spring, axis=-1)[..., None]
+    moment = xp.sum((spring - length)[..., None] * spring_site_m, axis=-2)
+    return length, -2.0 * moment / xp.sum(spring_site_m**2, axis=(-2, -1))[:, None]
+
+
+def arcs(length: Array, bend: Array) -> Frame:
+    """Return the ends of sections of constant curvature in the frames of their starts.
+
+    Args:
+        length, bend: as of `section_shapes`.
 
     Returns:
         Positions (..., n_sections, 3) and rotations (..., n_sections, 3, 3).
 
     Source: Webster, Jones, "Design and Kinematic Modeling of Constant Curvature Continuum Robots", 2010.
     """
-    xp = array_namespace(spring_m, spring_site_m)
-    # Length and bend by least squares over springs at equal angles
-    # (a section turns towards its shorter springs by |bend|)
-    spring = spring_m.reshape(*spring_m.shape[:-1], *spring_site_m.shape[:2])
-    length = xp.mean(spring, axis=-1)[..., None]  # (..., n_sections, 1)
-    moment = xp.sum((spring - length)[..., None] * spring_site_m, axis=-2)
-    bend = -2.0 * moment / xp.sum(spring_site_m**2, axis=(-2, -1))[:, None]
+    xp = array_namespace(length)
     square = xp.sum(bend**2, axis=-1)[..., None]
     angle = xp.sqrt(xp.where(square < _SMALL_BEND, _SMALL_BEND, square))
 
@@ -133,14 +252,6 @@ def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
         [xp.cos(0.5 * angle), across[..., 1:], -across[..., :1], xp.zeros_like(angle)], axis=-1
     )
     return Frame(position_m, rotation_from_quaternion(quaternion))
-
-
-def _ups(base_rotation: Array, rotation: Array) -> list[Array]:
-    """Return the direction against gravity (..., 3) in the frame of each section's end."""
-    ups = [base_rotation[2:]]
-    for section in range(rotation.shape[-3]):
-        ups.append(ups[-1] @ rotation[..., section, :, :])
-    return [up[..., 0, :] for up in ups[1:]]
 
 
 def chain(sections: Frame) -> Frame:
@@ -201,19 +312,21 @@ def expected_springs(model: SpringModel, pressure_kpa: Array) -> Array:
 
 def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int) -> PoseEstimator:
     """Take the estimator `name` from the entries of a file."""
-    n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
     return entries.network(
         name,
         PoseEstimator,
-        {"load_layers": (n_in + 1, n_out), "layers": (n_in, n_out)},
+        {},
+        coefficient=(n_sections, N_TERMS, N_CHANGES),
+        variable_centre=(n_sections, N_VARIABLES),
+        variable_scale=(n_sections, N_VARIABLES),
         spring_site_m=(n_sections, n_springs // n_sections, 2),
-        spring_centre_m=(n_springs,),
-        spring_scale_m=(n_springs,),
-        load_centre_kg=(),
-        load_scale_kg=(),
-        change_scale=(N_CHANGES,),
+        section_mass_kg=(n_sections,),
+        gripper_mass_kg=(),
+        tool_offset_m=(2,),
         base_position_m=(3,),
         base_rotation=(3, 3),
+        tip_offset_m=(3,),
+        tip_rotation=(3, 3),
     )
 
 

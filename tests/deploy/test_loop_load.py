@@ -15,12 +15,14 @@ from mjx_softarm.sensing.hysteresis import stop_after
 from tests.linear_arm import (
     GAIN_M_PER_KPA,
     LAG,
+    LOAD,
     POLICY,
     REST_M,
     SPEC,
     LinearArm,
     N,
     asking,
+    changed,
     go,
     load_estimator_of,
     read_m,
@@ -35,12 +37,10 @@ GOAL = np.array([0.0, 0.0, -585.0, 0.0, 0.0, 0.0])
 def loaded_policy():
     """The linear arm's policy, whose estimators are exact for payloads on it."""
     effect = np.linalg.pinv(GAIN_M_PER_KPA) @ np.full(N, -STRETCH_M_PER_KG)  # (n,) [kPa / kg]
-    sink = np.tile([0.0, 0.0, -SINK_M_PER_KG, 0.0, 0.0, 0.0], 3).astype(np.float32)
-    per_load = np.zeros((2 * N + 1, 18), np.float32), sink
     return dataclasses.replace(
         POLICY,
         load_estimator=load_estimator_of(SPEC, effect),
-        estimator=POLICY.estimator._replace(load_layers=(per_load,)),
+        estimator=changed(POLICY.estimator, [0.0, 0.0, -SINK_M_PER_KG, 0.0, 0.0, 0.0], (LOAD,)),
     )
 
 

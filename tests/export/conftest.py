@@ -28,15 +28,18 @@ def layers(*sizes, scale):
 
 def busy_policy(spec=SPEC):
     """The linear arm's policy with an actor, an estimator and a sim-to-real network that change much."""
-    policy, n, n_sections = make_policy(spec), spec.n_springs, spec.structure.n_sections
+    policy, n = make_policy(spec), spec.n_springs
     n_in = N_POSE_INPUTS + n
     anchors = np.float32(np.random.default_rng(6).normal(0.0, 0.1, (5, n_in)))
     network, bound = layers(n_in, 8, N_POSE_OUTPUTS, scale=0.3), np.repeat([9.0, 0.1], 3)
     s2r = s2r_of(network, bound, anchors=anchors, limit=np.float32(0.335))
+    sizes = policy.estimator.coefficient.shape
+    coefficient = 0.001 * np.random.default_rng(7).normal(size=sizes)
+    mounting = {"tip_offset_m": [0.01, 0.0, -0.02], "base_position_m": [0.0, 0.02, 0.01]}
     estimator = policy.estimator._replace(
-        layers=layers(n + 3 * n_sections, 6, 6 * n_sections, scale=0.2),
-        load_layers=layers(n + 3 * n_sections + 1, 6, 6 * n_sections, scale=0.2),
-        change_scale=np.full(6, 0.01, np.float32),
+        coefficient=np.float32(coefficient),
+        variable_scale=np.full_like(policy.estimator.variable_scale, 0.7),
+        **{name: np.float32(value) for name, value in mounting.items()},
     )
     # 1 kPa less in every chamber than its springs show is half a kilogram
     load = load_estimator_of(spec, np.full(spec.n_chambers, -2.0))

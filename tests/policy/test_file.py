@@ -24,8 +24,8 @@ from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
-# Digest of the names that schema 16 stores and of the fields of its specification.
-SCHEMA_16 = "89803db7"
+# Digest of the names that schema 17 stores and of the fields of its specification.
+SCHEMA_17 = "2a9326c1"
 TWO_SECTIONS = ArmSpec.default().replace(structure={"n_sections": 2})
 
 
@@ -109,7 +109,7 @@ def test_what_is_saved_is_loaded_and_has_the_same_bytes(file, make_policy):
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
-    assert arrays["schema_version"] == 16 and arrays["s2r_kind"] == "mlp"
+    assert arrays["schema_version"] == 17 and arrays["s2r_kind"] == "mlp"
     parts, axes = ("pose", "goal", "error"), ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
     assert arrays["obs_layout"].tolist() == [f"{part}_{axis}" for part in parts for axis in axes]
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
@@ -174,8 +174,8 @@ def test_files_that_are_no_policy(tmp_path):
 
 
 def test_another_schema_is_named_before_anything_else(file):
-    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(15))
-    assert refusal(file) == "schema_version: got 15, expected 16: export the run again, or train it anew"
+    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(16))
+    assert refusal(file) == "schema_version: got 16, expected 17: export the run again, or train it anew"
 
 
 def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file, hold):
@@ -204,9 +204,12 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ({"gains__pressure_min_kpa": np.array(20.0)}, "gains.pressure_min_kpa: got 20.0, expected less than"),
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 16"),
+        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 17"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
-        ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
+        (
+            {"spring_model__spring_scale_m": np.zeros(9, np.float32)},
+            "spring_model.spring_scale_m: got [0.0, ",
+        ),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
         ({"spec_json": np.array('{"nose": 1}')}, "spec_json: nose: got an unknown field, expected name, "),
         ({"rate_hz": np.array([{}])}, "got a damaged array ("),
@@ -243,12 +246,12 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, m
     assert file.read_bytes() == before
 
 
-def test_schema_16_stays_as_it_is(file, make_policy):
+def test_schema_17_stays_as_it_is(file, make_policy):
     groups = make_policy().spec.to_dict().items()
     fields = [f"{name}.{item}" for name, group in groups if isinstance(group, dict) for item in group]
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
-    assert digest == SCHEMA_16, "other entries, or other fields of ArmSpec: raise SCHEMA_VERSION?"
+    assert digest == SCHEMA_17, "other entries, or other fields of ArmSpec: raise SCHEMA_VERSION?"
 
 
 def test_the_policies_that_ship_are_small_and_one_is_calibrated():

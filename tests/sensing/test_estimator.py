@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm.sensing.estimator import (
     N_CHANGES,
+    N_VARIABLES,
     Frame,
     PoseEstimator,
     SpringModel,
@@ -18,6 +19,7 @@ from mjx_softarm.sensing.estimator import (
     expected_springs,
 )
 from mjx_softarm.sensing.pose import frame_from_pose
+from tests.linear_arm import LOAD, changed, even_estimator
 
 N, RADIUS_M = 9, 0.067
 ANGLE = np.radians(90.0) + 2 * np.pi * np.arange(N) / 3
@@ -38,19 +40,15 @@ def integrated(length_m, towards_rad, bend_rad, n=20_000):
     return middle.apply([0, 0, -length_m]).mean(axis=0), Rotation.from_rotvec(bend_rad * axis).as_matrix()
 
 
-def network(seed, size=1.0, dtype=np.float32):
-    """An estimator with random layers."""
-    rng = np.random.default_rng(seed)
-    networks = [
-        tuple(
-            (size * rng.normal(size=(n_in, n_out)) / np.sqrt(n_in), size * 0.1 * rng.normal(size=n_out))
-            for n_in, n_out in ((n_inputs, 32), (32, 3 * N_CHANGES))
-        )
-        for n_inputs in (2 * N, 2 * N + 1)
-    ]
-    numbers = np.full(N, 0.03), 0.2, 0.8, np.repeat([0.003, 0.015], 3)
-    arrays = (*networks, SITE_M, STRAIGHT_M, *numbers)
-    return PoseEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), arrays))
+def random_estimator(seed, size=1.0, dtype=np.float32):
+    """An estimator with random polynomials, of variables beyond their range as well as in it."""
+    even, rng = even_estimator(SITE_M), np.random.default_rng(seed)
+    coefficient = size * rng.normal(size=even.coefficient.shape) * np.repeat([1e-4, 5e-4], 3)
+    centre, scale = np.zeros(N_VARIABLES), np.ones(N_VARIABLES)
+    centre[0], scale[:3] = 0.2, [0.03, 0.5, 0.5]
+    each = {"variable_centre": np.tile(centre, (3, 1)), "variable_scale": np.tile(scale, (3, 1))}
+    estimator = even._replace(coefficient=coefficient, **each)
+    return PoseEstimator(*(np.asarray(value, dtype) for value in estimator))
 
 
 @pytest.mark.parametrize("bend_rad", [0.0, 1e-5, 3e-3, 0.4, 1.7])
@@ -94,28 +92,29 @@ def test_sections_follow_one_another():
 
 
 def test_changes_move_and_turn_the_section_ends():
-    """A network whose outputs are constant: position added, Gibbs vector as a rotation on the left."""
+    """Constant changes and one by payload: position added, Gibbs vector as a rotation on the left."""
     rng = np.random.default_rng(0)
     changes = rng.normal(size=(3, N_CHANGES)) * np.repeat([0.01, 0.2], 3)
-    estimator = network(0, dtype=np.float64)._replace(
-        layers=((np.zeros((2 * N, 18)), 0.7 * changes.ravel()),),
-        load_layers=((np.zeros((2 * N + 1, 18)), 0.2 * changes.ravel()),),
-        change_scale=np.ones(6),
-    )
+    estimator = PoseEstimator(*(np.asarray(value, np.float64) for value in even_estimator(SITE_M)))
+    estimator = changed(changed(estimator, 0.3 * changes), 0.5 * changes, (LOAD,))
+    mounting = {"tip_offset_m": rng.normal(size=3), "base_position_m": rng.normal(size=3)}
+    turns = Rotation.from_euler("xyz", rng.normal(size=(2, 3))).as_matrix()
+    estimator = estimator._replace(**mounting, tip_rotation=turns[0], base_rotation=turns[1])
     spring_m = 0.2 + 0.03 * rng.normal(size=N)
     even = constant_curvature(SITE_M, spring_m)
     angle = 2 * np.arctan(np.linalg.norm(changes[:, 3:], axis=1))
     axis = changes[:, 3:] / np.linalg.norm(changes[:, 3:], axis=1, keepdims=True)
     turn = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
     expected = chain(Frame(even.position_m + changes[:, :3], turn @ even.rotation))
-    got = estimate_frame(estimator, spring_m, 1.4)  # 1.5 times the scale above the centre
-    np.testing.assert_allclose(got.position_m, expected.position_m, atol=1e-12)
-    np.testing.assert_allclose(got.rotation, expected.rotation, atol=1e-12)
+    got = estimate_frame(estimator, spring_m, 1.4)
+    plate_m = expected.position_m + expected.rotation @ mounting["tip_offset_m"]
+    np.testing.assert_allclose(got.position_m, mounting["base_position_m"] + turns[1] @ plate_m, atol=1e-12)
+    np.testing.assert_allclose(got.rotation, turns[1] @ expected.rotation @ turns[0], atol=1e-12)
     np.testing.assert_allclose(got.rotation @ got.rotation.T, np.eye(3), atol=1e-12)
 
 
 def test_numpy_and_jax_agree_and_batches_are_rows():
-    estimator, rng = network(1), np.random.default_rng(1)
+    estimator, rng = random_estimator(1), np.random.default_rng(1)
     spring_m = (0.2 + 0.03 * rng.normal(size=(2, 50, N))).astype(np.float32)
     load_kg = np.float32([[0.0], [1.0]])
     pose = estimate(estimator, spring_m, load_kg)
@@ -131,11 +130,11 @@ def test_numpy_and_jax_agree_and_batches_are_rows():
 
 
 def test_straight_arm_has_a_slope():
-    slope = jax.jit(jax.jacobian(lambda s: estimate_frame(network(2), s, 0.0).position_m))(
+    slope = jax.jit(jax.jacobian(lambda s: estimate_frame(random_estimator(2), s, 0.0).position_m))(
         jnp.asarray(STRAIGHT_M)
     )
     step = 1e-4 * np.eye(N)
-    double = network(2, dtype=np.float64)
+    double = random_estimator(2, dtype=np.float64)
     ahead, back = (estimate_frame(double, STRAIGHT_M + sign * step, 0.0).position_m for sign in (1, -1))
     np.testing.assert_allclose(slope, (ahead - back).T / 2e-4, atol=2e-2)
     assert np.abs(slope).max() > 0.5
@@ -146,7 +145,7 @@ def test_nothing_jumps_through_gimbal_lock():
     share = np.linspace(0.9, 1.1, 400)[:, None]
     bent = np.concatenate([springs_of(0.2, 0.0, np.pi / 6)] * 3)
     spring_m = (0.2 + share * (bent - 0.2)).astype(np.float32)
-    estimator = network(3, size=0.1)
+    estimator = random_estimator(3, size=0.1)
     assert np.abs(estimate(estimator, spring_m, 0.0)[:, 4]).max() > 85.0
     frame = estimate_frame(estimator, spring_m, 0.0)
     assert np.abs(np.diff(frame.rotation, axis=0)).max() < 2e-3
