@@ -112,7 +112,7 @@ def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> Step
     """Fit pumps or regulators to commanded and measured pressures, or to commands and springs."""
     spec = arm.spec
     tracks, lag = find_tracks(measurements.logs, spec), MEASURED
-    if not tracks and (resting_kpa := _pressures_by_springs(measurements, spec, seed)):
+    if not tracks and (resting_kpa := pressures_by_springs(measurements, spec, seed)):
         # No pressure was measured: the springs are the gauge, and the shape shows the arm's own lag
         tracks = find_tracks(measurements.logs, spec, resting_kpa)
         shape = fit_shape(measurements.logs, spec) if tracks else None
@@ -131,7 +131,7 @@ def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> Step
     return StepResult(arm._replace(spec=fit.spec), sections.actuators(fit))
 
 
-def _pressures_by_springs(
+def pressures_by_springs(
     measurements: Measurements, spec: ArmSpec, seed: int
 ) -> Callable[[np.ndarray], np.ndarray] | None:
     """Return the pressures (n, c) [kPa] of the arm at rest by its spring lengths (n, n_springs) [m].

@@ -212,11 +212,15 @@ def test_commands_in_force_are_their_mean_over_the_time_before_the_dead_time():
         before, earlier = command, pushed(earlier, before)
 
 
-@pytest.mark.parametrize(("engine", "step_s", "most_mm"), [(midpoint, PERIOD_S, 0.3), (mjx_step, 0.005, 0.8)])
-def test_arms_behind_slow_regulators_move_as_c_mujoco_does(engine, step_s, most_mm):
-    """Commands wait for no, two and a half, and some four control periods."""
+@pytest.mark.parametrize(
+    ("engine", "step_s", "share", "most_mm"),
+    [(midpoint, PERIOD_S, 1.0, 0.3), (midpoint, PERIOD_S, 0.0, 0.3), (mjx_step, 0.005, 1.0, 0.8)],
+)
+def test_arms_behind_slow_regulators_move_as_c_mujoco_does(engine, step_s, share, most_mm):
+    """Commands wait for no, two and a half, and some four control periods; `share` of the volume counts."""
     dead_time_s = (0.0, 0.05, 0.085)
     numbers = {"lag_s": 0.3, "fill_kpa_per_s": 60.0, "vent_kpa_per_s": 25.0, "deadband_kpa": 0.2}
+    numbers["volume_share"] = share
     spec = SHORT.replace(actuators={"kind": "regulator", "dead_time_s": dead_time_s, **numbers})
     start, asked = starts(spec, 4), references(spec, 4)
     regulator = jax.tree.map(np.float32, spec.actuators.per_chamber(3))

@@ -7,16 +7,21 @@ import pytest
 from scipy.signal import lfilter
 
 from calib.arm import CalibratedArm
+from calib.fit.chambers import MIN_POSES
 from calib.fit.motion.actuators import ArmLag, fit_actuators, with_actuators
 from calib.fit.motion.tracks import find_tracks
+from calib.fit.s2r import simulate_poses
 from calib.read.measurements import measure
-from calib.steps import actuators
+from calib.steps import actuators, pressures_by_springs
 from mjx_softarm.deploy.record import record
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.pneumatics import Pneumatics, Pump, Regulator
 from mjx_softarm.twin.instruments import Build
 from mjx_softarm.twin.rod_twin import RodTwin, draw_regulator
+from tests.calib.fit.planted import planted, pose_log
+from tests.calib.fit.planted import random_pressures as planted_pressures
 
 TIME_S, PERIOD_S, STEPS = 60.0, 0.02, 4
 FACTORS = np.linspace(0.9, 1.1, 3)
@@ -165,6 +170,18 @@ def test_springs_show_regulators_whose_pressures_are_not_measured(short):
         found, true = np.array(getattr(fit.spec.actuators, name)), np.full(3, getattr(plant, name))
         np.testing.assert_allclose(found[moved], true[moved], rtol=0.15, err_msg=name)
         assert (np.abs(found - true) < fit.half_width_95[name])[moved].all()
+
+
+def test_springs_of_an_arm_at_rest_show_its_pressures(spec):
+    """The arm is unlike its specification; the poses at rest make up for most of that."""
+    arm = planted(spec=spec)
+    resting_kpa = pressures_by_springs(measure([pose_log(arm, 150, 0)], spec), spec, 0)
+    others = settle_many(arm, planted_pressures(60, 1))
+    off_kpa = resting_kpa(others.spring_m) - others.pressure_kpa
+    uncorrected_kpa = simulate_poses(spec, others.spring_m).pressure_kpa - others.pressure_kpa
+    rms, before = (np.sqrt(np.mean(x**2)) for x in (off_kpa, uncorrected_kpa))
+    assert rms < 0.3 * before and rms < 0.5
+    assert pressures_by_springs(measure([pose_log(arm, MIN_POSES - 1, 0)], spec), spec, 0) is None
 
 
 def test_a_log_without_commands_or_of_poses_alone_says_so(short):
