@@ -205,9 +205,9 @@ def _measure(
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     finish(driver, tell)
     print_run(run, controller.policy)
+    print_origin(controller.policy, options.arm)
     if run.arrivals:
         _report_accuracy(run, controller, poses, out, payload_kg)
-    print_origin(controller.policy, options.arm)
     return run.status
 
 

@@ -328,25 +328,23 @@ def print_run(run: LoopRun, policy: Policy) -> None:
 
 
 def print_figures(numbers: dict[str, Any]) -> None:
-    """Print the figures of an accuracy."""
-    for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
-        mean = numbers[f"{name}_{unit}"]
-        high = numbers[f"{name}_95_{unit}"]
-        most = numbers[most]
-        if np.isnan(mean):  # goals do not ask for it
-            continue
-        print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
+    """Print the figures of an accuracy: a line for the path, if there is one, and one for the stops."""
+    stops = f"{numbers['measured']} of {numbers['points']} goals"
     if "way_s" in numbers:
         print(
-            f"on the path, {numbers['way_s']:.0f} s [mm]: mean {numbers['way_mm']:.2f}, 95 % below "
+            f"path in {numbers['way_s']:.0f} s: mean {numbers['way_mm']:.2f} mm, 95 % below "
             f"{numbers['way_95_mm']:.2f}, at most {numbers['way_max_mm']:.2f}; "
             f"{numbers['lag_s']:.2f} s behind, without that {numbers['way_without_lag_mm']:.2f}"
         )
-        passed = numbers["points"] - numbers["measured"]
-        measured = f"{numbers['measured']} stops measured, {passed} goals passed on the path"
-    else:
-        measured = f"{numbers['measured']} of {numbers['points']} goals measured"
-    print(f"{measured}; saturated chambers at {numbers['saturated_points'] or 'none'} of them")
+        stops = f"{numbers['measured']} stops"
+    parts = [
+        f"mean {numbers[f'{name}_{unit}']:.2f} {unit}, 95 % below {numbers[f'{name}_95_{unit}']:.2f}, "
+        f"at most {numbers[most]:.2f}"
+        for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg"))
+        if not np.isnan(numbers[f"{name}_{unit}"])  # goals ask for it
+    ]
+    parts.append(f"saturated chambers at {numbers['saturated_points'] or 'none'}")
+    print(f"{stops}: {'; '.join(parts)}")
 
 
 def print_origin(policy: Policy, arm: str) -> None:

@@ -99,4 +99,4 @@ def test_what_the_file_cannot_hold_is_refused(policy, options, message, run, tmp
 
 def test_the_contents_of_a_policy_are_named():
     lines = "\n".join(contents(load_policy(SHIPPED)))
-    assert "18-192-192-192-192-9, swish" in lines and "tip 0.56 mm" in lines and "2,048 poses" in lines
+    assert "18-256-256-256-256-9, swish" in lines and "tip 0.015 mm" in lines and "2,048 poses" in lines
