@@ -88,11 +88,11 @@ class ChainHessian(NamedTuple):
             reduced.append(solved)
         # From the base to the tip: substitute
         motion = jnp.zeros_like(pull)  # motion of all sections further up
-        found = []
+        solution = []
         for above, solved in zip(self.above, reversed(reduced), strict=True):
-            found.append(solved[:, rank:] - product(solved[:, :rank], motion))
-            motion = motion + product(jnp.swapaxes(above, 0, 1), found[-1])
-        return jnp.stack(found)
+            solution.append(solved[:, rank:] - product(solved[:, :rank], motion))
+            motion = motion + product(jnp.swapaxes(above, 0, 1), solution[-1])
+        return jnp.stack(solution)
 
 
 @jax.custom_vjp
@@ -106,5 +106,5 @@ def solve_approximate_gradient(matrix: ChainHessian, columns: Array) -> Array:
 
 solve_approximate_gradient.defvjp(
     lambda matrix, columns: (matrix.solve(columns), matrix),
-    lambda matrix, d_found: (None, matrix.solve(d_found)),
+    lambda matrix, d_solution: (None, matrix.solve(d_solution)),
 )

@@ -128,16 +128,16 @@ def estimate_load(
         95 % interval.
     """
     xp = array_namespace(spring_m, pressure_kpa, estimator.slope)
-    found = holding(estimator, spring_m)
-    effect = found.effect_kpa_per_kg
+    predicted = holding(estimator, spring_m)
+    effect = predicted.effect_kpa_per_kg
     pressure_kpa = xp.asarray(pressure_kpa, dtype=estimator.slope.dtype)
     pressure_kpa = pressure_kpa - estimator.hysteresis_kpa * xp.asarray(stop, dtype=estimator.slope.dtype)
-    left_kpa = pressure_kpa.reshape(*effect.shape) - found.pressure_kpa
-    known = xp.exp(found.log_share)[..., None, None] * estimator.covariance_kpa2 + estimator.error_kpa2
-    own = np.eye(effect.shape[-1], dtype=estimator.slope.dtype) * (OWN_FACTOR * effect[..., None]) ** 2
+    left_kpa = pressure_kpa.reshape(*effect.shape) - predicted.pressure_kpa
+    known = xp.exp(predicted.log_share)[..., None, None] * estimator.covariance_kpa2 + estimator.error_kpa2
+    each = np.eye(effect.shape[-1], dtype=estimator.slope.dtype) * (OWN_FACTOR * effect[..., None]) ** 2
     kg = variance = xp.zeros_like(effect[..., 0, 0])
     for _ in range(N_PASSES):
-        weight = solve(known + (kg**2)[..., None, None, None] * own, effect)
+        weight = solve(known + (kg**2)[..., None, None, None] * each, effect)
         variance = 1.0 / xp.sum(weight * effect, axis=(-2, -1))
         kg = variance * xp.sum(weight * left_kpa, axis=(-2, -1))
     return estimator.own_load_kg + kg, QUANTILE * xp.sqrt(variance + (estimator.factor_sd * kg) ** 2)

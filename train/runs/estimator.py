@@ -226,12 +226,12 @@ def fit_load_estimator(arm: CalibratedArm, loaded: LoadedPool, seed: int) -> Loa
     first = _first_load_estimator(arm, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
     network = _fit(first, _holding_loss, learned, keys[4], n_schedules=LOAD_SCHEDULES)
     # The network's own error. It is larger at the rim, so the intervals of 95 % of these poses shall hold it.
-    found_kpa = holding(network, judging.spring_m).pressure_kpa
+    predicted_kpa = holding(network, judging.spring_m).pressure_kpa
     true_kpa = judging.out[:, : spec.n_chambers]
-    error = _square(found_kpa - true_kpa.reshape(found_kpa.shape))
+    error = _square(predicted_kpa - true_kpa.reshape(predicted_kpa.shape))
     alone = network._replace(covariance_kpa2=jnp.zeros_like(error), error_kpa2=error)
-    told_kg, half_width_kg = estimate_load(alone, judging.spring_m, true_kpa)
-    widened = jnp.quantile(jnp.abs(told_kg - own_kg) / half_width_kg, 0.95) ** 2
+    estimated_kg, half_width_kg = estimate_load(alone, judging.spring_m, true_kpa)
+    widened = jnp.quantile(jnp.abs(estimated_kg - own_kg) / half_width_kg, 0.95) ** 2
     return network._replace(error_kpa2=widened * error)
 
 
@@ -297,8 +297,8 @@ def _stronger(spec: ArmSpec) -> ArmSpec:
 
 def _holding_loss(estimator: LoadEstimator, rows: _Holding) -> Array:
     """Return the mean square of the outputs' errors, as shares of what a plane leaves."""
-    found = holding(estimator, rows.spring_m)
-    each = [x.reshape(len(rows.out), -1) for x in found]
+    predicted = holding(estimator, rows.spring_m)
+    each = [x.reshape(len(rows.out), -1) for x in predicted]
     off = (jnp.concatenate(each, axis=1) - rows.out) / estimator.out_scale
     weight = jnp.ones(off.shape[1]).at[: each[0].shape[1]].set(PRESSURE_WEIGHT)
     return jnp.mean(weight * off**2)
@@ -381,10 +381,10 @@ def _scaling(name: str, unit: str, values: Array) -> dict[str, Array]:
 def _errors(learned: Distilled, arm: CalibratedArm) -> dict[str, dict[float, Error]]:
     """Return errors by payload on top of the specification's.
 
-    `tip_mm` and `turn_deg` are errors of the pose network with the true load. `load_kg` is the error of arms
-    whose chambers are off, `spring_mm` the error of each arm's worst spring.
+    `tip_mm` and `turn_deg` are errors of the estimated pose with the true load. `load_kg` is the error of
+    arms whose chambers are off, `spring_mm` the error of each arm's worst spring.
     """
-    spec, found = arm.spec, dict[str, dict[float, Error]]()
+    spec, errors_by_name = arm.spec, dict[str, dict[float, Error]]()
     for share in PAYLOADS:
         payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
@@ -402,15 +402,15 @@ def _errors(learned: Distilled, arm: CalibratedArm) -> dict[str, dict[float, Err
         springs = np.abs(expected_springs(learned.spring_model, pool.pressure_kpa) - pool.spring_m)
         # Estimate the load of arms whose chambers are off.
         off = _loaded(arm, many_kg, HELD_OUT_SEED)
-        told_kg, half_width_kg = estimate_load(learned.load_estimator, off.spring_m, off.pressure_kpa)
+        estimated_kg, half_width_kg = estimate_load(learned.load_estimator, off.spring_m, off.pressure_kpa)
         errors = {
             "tip_mm": 1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1),
             "turn_deg": np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))),
-            "load_kg": np.abs(np.asarray(told_kg) - load_kg),
+            "load_kg": np.abs(np.asarray(estimated_kg) - load_kg),
             "load_half_width_kg": np.asarray(half_width_kg),
             "spring_mm": 1e3 * springs.max(axis=-1),
         }
         for name, values in errors.items():
             quantiles = (float(np.quantile(values, share)) for share in (0.5, 0.95, 1.0))
-            found.setdefault(name, {})[payload_kg] = Error(*quantiles)
-    return found
+            errors_by_name.setdefault(name, {})[payload_kg] = Error(*quantiles)
+    return errors_by_name
