@@ -19,7 +19,6 @@ from calib.changes import fit_changes
 from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
-from calib.fit.markers import MIN_MARKERS, marker_limits
 from calib.fit.motion.actuators import MEASURED, ArmLag, fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
@@ -101,11 +100,7 @@ def chambers(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
         remedy = f"stiffness, area and length are not this arm's: log {MIN_POSES} poses at rest or more"
         return StepResult(arm, Section("Chambers", needed, warnings=(remedy,)))
     fit = fit_chambers(measurements, arm.spec, seed)
-    section = sections.chambers(fit)
-    # Check the chambers' lengths by markers along the arm.
-    if fit.has_markers and fit.poses.marker_m.shape[1] >= MIN_MARKERS:
-        section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
-    return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, section)
+    return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, sections.chambers(fit))
 
 
 def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:

@@ -23,12 +23,10 @@ import numpy as np
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import N_KINDS, Measured, error_groups, simulate, tip_changes
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal, refine
-from calib.fit.markers import section_ends
 from calib.fit.parameters import by_name, half_widths, names, priors, spec_at, tolerances
 from calib.fit.pose_errors import PoseErrors, errors_of
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
-from mjx_softarm._support.errors import InputError
 from mjx_softarm.spec import BONDS, ArmSpec
 
 MIN_POSES = 20
@@ -40,6 +38,7 @@ MIN_SCALE = (1e-4, 1e-3, 1e-4, 1e-4)  # least values of the same scales
 MAX_RATIO = 2.0  # warn from this ratio of calibrated to specified values, or of held-out to other errors
 NOTED_TURN_DEG = 1.0  # turn of the measured tip from which there is a note
 MAX_PRESSURE_GAP = 0.1  # share of the pressure range that may be missing at either end
+MAX_OFF_PLATE_M = 0.01  # distance of the last marker from the tip's plate, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +63,7 @@ class ChamberFit:
     poses: StaticPoses  # in the order of the logs
     is_held_out: np.ndarray  # (n,) bool
     tip_error_mm: np.ndarray  # (n,) tip error of the first fit; NaN where the arm did not settle
-    chamber_m: np.ndarray  # (n, n_chambers) chamber lengths of the last fit
     warnings: tuple[str, ...]  # reasons not to trust the fit, each with its remedy
-
-    @property
-    def has_markers(self) -> bool:
-        """Whether markers at the sections' ends took part."""
-        return self.scale.shape[1] == len(SCALE)
 
     @property
     def is_better(self) -> bool:
@@ -103,15 +96,14 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
     poses = measurements.poses.with_lengths(spec)
     # Fit without the held-out poses, then, from there, to all poses.
     held_out = held_out_blocks(poses.n, block=HELD_OUT_BLOCK, seed=seed)
-    end_m, complaints = _section_ends(poses, spec)
+    end_m, complaints = section_ends(poses, spec)
     measured = Measured(
         poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m, end_m
     )
     judged, solution = _solutions(spec, measured, held_out)
     # Judge the specification and the first fit, and name the directions that the last fit does not know.
-    before, _, _ = simulate(spec, measured, np.zeros_like(solution.x))
-    after, _, _ = simulate(spec, measured, judged.x)
-    _, _, chamber_m = simulate(spec, measured, solution.x)
+    before, _ = simulate(spec, measured, np.zeros_like(solution.x))
+    after, _ = simulate(spec, measured, judged.x)
     calibrated = _calibrated(spec, solution.x, poses)
     bent, straight = solution.scale.reshape(2, -1)
     widths, directions = principal(solution, tolerances(spec))
@@ -135,7 +127,6 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
         poses=poses,
         is_held_out=held_out,
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
-        chamber_m=chamber_m,
         warnings=(),
     )
     return dataclasses.replace(found, warnings=complaints + _warnings(found, spec, solution))
@@ -148,16 +139,37 @@ def _solutions(spec: ArmSpec, measured: Measured, held_out: np.ndarray) -> tuple
         group %= N_KINDS
     problem = Problem(priors(spec), group, np.tile(SCALE, 2), np.tile(MIN_SCALE, 2))
     part, learned = dataclasses.replace(problem, group=group[~held_out]), measured.take(~held_out)
-    judged = fit(lambda x: simulate(spec, learned, x)[:2], part)
-    return judged, refine(lambda x: simulate(spec, measured, x)[:2], judged.x, problem)
+    judged = fit(lambda x: simulate(spec, learned, x), part)
+    return judged, refine(lambda x: simulate(spec, measured, x), judged.x, problem)
 
 
-def _section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the markers at the sections' ends, NaN where they are not to be used, and why not."""
-    try:
-        return section_ends(poses, spec), ()
-    except InputError as error:  # the fit goes without them
-        return np.full((poses.n, spec.structure.n_sections, 3), np.nan), (str(error),)
+def section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the markers on the sections' last plates, and why they are not to be used.
+
+    Markers sit on rings, equally many in each section, the last of each anywhere on its last plate.
+
+    Returns:
+        Markers (n, n_sections, 3) [m], NaN where not measured or not to be used; reasons.
+    """
+    n_markers, n_sections = poses.marker_m.shape[1], spec.structure.n_sections
+    nothing = np.full((poses.n, n_sections, 3), np.nan)
+    if n_markers == 0:
+        return nothing, ()
+    if n_markers % n_sections:
+        return nothing, (f"markers: got {n_markers}, expected as many in each of {n_sections} sections",)
+    seen = poses.take(np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2))))
+    if not seen.n:
+        return nothing, ("markers: got no pose at rest that has them, expected one or more",)
+    # Height of the last marker above the tip's plate, in the tip's frame
+    last_m = np.einsum("nij,ni->nj", seen.tip_rotation, seen.marker_m[:, -1] - seen.tip_m)
+    above_m = np.median(last_m[:, 2])
+    if abs(above_m) > MAX_OFF_PLATE_M:
+        return nothing, (
+            f"markers: got the last {1e3 * above_m:+.1f} mm above the tip's plate, expected it in the "
+            f"plate within {1e3 * MAX_OFF_PLATE_M:.0f} mm: number the markers from base to tip",
+        )
+    step = n_markers // n_sections
+    return poses.marker_m[:, step - 1 :: step], ()
 
 
 def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:

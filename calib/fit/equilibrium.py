@@ -16,7 +16,6 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
-from mjx_softarm.mechanics.statics import tendons
 from mjx_softarm.mechanics.workspace import pressure_levels
 from mjx_softarm.spec import ArmSpec
 
@@ -41,7 +40,7 @@ class Measured(NamedTuple):
         return Measured(*(value[poses] for value in self))
 
 
-def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array, Array]:
+def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array]:
     """Return simulated minus measured pose of one arm at rest.
 
     Args:
@@ -52,7 +51,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     Returns:
         Errors (6 + n_springs + 3 n_sections,) of the tip [m], the rotation [rad] as its axis times the sine
         of the angle, the springs [m] and the markers at the sections' ends [m]; largest residual force () [N,
-        N m]; chamber lengths (n_chambers,) [m].
+        N m].
     """
     # Settle the arm at the measured pressures.
     masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
@@ -60,7 +59,6 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         found = settle_pressures(arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa))
         frames = chain_kinematics(arm)(found.q)
-        chamber_m = tendons(jax.lax.stop_gradient(frames), arm.chamber_site_m).length.reshape(-1)
         turn = measured.tip_rotation.T @ found.tip_rotation
         end_m = _section_ends(frames, marker_sites(x, arm))
     # Compare it with the measured pose.
@@ -71,7 +69,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         found.spring_m - measured.spring_m,
         (end_m - measured.end_m).reshape(-1),
     ]
-    return jnp.concatenate(error), found.residual, jax.lax.stop_gradient(chamber_m)
+    return jnp.concatenate(error), found.residual
 
 
 def error_groups(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
@@ -106,7 +104,7 @@ def unmeasured(
     return Measured(pressure_kpa, payload_kg, tip_m, tip_rotation, spring_m, end_m)
 
 
-def simulate(spec: ArmSpec, measured: Measured, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate(spec: ArmSpec, measured: Measured, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Simulate all poses at x.
 
     Args:
@@ -115,13 +113,12 @@ def simulate(spec: ArmSpec, measured: Measured, x: np.ndarray) -> tuple[np.ndarr
         x (p,): see `calib.fit.parameters`.
 
     Returns:
-        Errors (n, m) of `residuals`, inf where the arm does not settle; their Jacobian (n, m, p); chamber
-        lengths (n, n_chambers) [m].
+        Errors (n, m) of `residuals`, inf where the arm does not settle; their Jacobian (n, m, p).
     """
     start, params = free_arm(spec, x)
     simulated = functools.partial(_jacobian(), np.float32(start), params)
-    error, slope, settled, chamber_m = xla.in_batches(simulated, BATCH, measured)
-    return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
+    error, slope, settled = xla.in_batches(simulated, BATCH, measured)
+    return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float)
 
 
 def tip_changes(spec: ArmSpec, x: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -143,21 +140,21 @@ def tip_changes(spec: ArmSpec, x: np.ndarray, change: np.ndarray) -> np.ndarray:
     pressure_kpa = np.concatenate([random_pressures(spec, N_WORKSPACE - len(extremes), rng), extremes])
     payload_kg = np.where(np.arange(N_WORKSPACE) % 2, spec.mass.largest_payload_kg, 0.0)
     rotation = np.broadcast_to(np.eye(3), (N_WORKSPACE, 3, 3))
-    error, slope, _ = simulate(spec, unmeasured(spec, pressure_kpa, payload_kg, rotation), x)
+    error, slope = simulate(spec, unmeasured(spec, pressure_kpa, payload_kg, rotation), x)
     settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))
     return np.linalg.norm(slope[settled, :3] @ change, axis=1).max(axis=0, initial=0.0)
 
 
 @functools.cache
 def _jacobian():
-    """Return the compiled errors, Jacobian, mask of settled arms and chamber lengths of a batch."""
+    """Return the compiled errors, Jacobian and mask of settled arms of a batch."""
 
     def one(x, params: ArmParams, measured: Measured):
         def errors(x):
-            error, left, chamber_m = residuals(x, params, measured)
-            return error, (error, left, chamber_m)
+            error, left = residuals(x, params, measured)
+            return error, (error, left)
 
-        slope, (error, left, chamber_m) = jax.jacfwd(errors, has_aux=True)(x)
-        return error, slope, left < RESIDUAL_TOLERANCE, chamber_m
+        slope, (error, left) = jax.jacfwd(errors, has_aux=True)(x)
+        return error, slope, left < RESIDUAL_TOLERANCE
 
     return xla.jit(jax.vmap(one, in_axes=(None, None, 0)))

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from calib.changes import Changes
 from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import PressureFit
-from calib.fit.markers import MarkerLimits
 from calib.fit.motion.actuators import MARGIN, MARGIN_BY_SPRINGS, SMALL_KPA, ActuatorFit
 from calib.fit.motion.damping import DampingFit
 from calib.fit.motion.shape import ShapeFit
@@ -118,7 +117,7 @@ def chambers(fit: ChamberFit) -> Section:
         + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
         (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
-        plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
+        plain(fit, "spec", "poses", "is_held_out", "tip_error_mm")
         | {"values": values | dict(parts) | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
         fit.notes,
@@ -144,25 +143,6 @@ def _mounting(fit: ChamberFit) -> ReportTable:
             for label, value, width in zip(labels, values, fit.half_width_95[name], strict=True)
         ]
     return ReportTable(("", "value", "+-"), tuple(rows))
-
-
-def with_markers(section: Section, limits: MarkerLimits) -> Section:
-    """Add the chambers' lengths at the most bent poses, measured by markers, to their section."""
-    figure, axes = _figure()
-    axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
-    axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
-    axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
-    lengths = ("chambers at the most bent poses", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
-    simulated = (float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max))
-    rows = (lengths, ("simulated at the same poses", *simulated))
-    table = ReportTable(("", "shortest [mm]", "longest [mm]"), rows)
-    title = f"chambers at the {len(limits.pose)} most bent poses"
-    return dataclasses.replace(
-        section,
-        tables=(*section.tables, table),
-        data=section.data | {"markers": plain(limits)},
-        figures=(*section.figures, (title, figure)),
-    )
 
 
 def s2r(
