@@ -9,14 +9,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from calib.arm import CalibratedArm
 from calib.changes import MIN_POSES as MIN_LATER
 from calib.changes import fit_changes
-from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.motion.actuators import MEASURED, ArmLag, fit_actuators
@@ -31,9 +30,8 @@ from calib.fit.payload import (
     payload_intervals,
     payload_poses,
 )
-from calib.fit.pose_errors import PoseErrors, pose_errors
-from calib.fit.s2r import SimulatedPoses, fit_printed, fit_s2r, moved, simulate_poses
-from calib.fit.sensors import fit_springs
+from calib.fit.s2r import SimulatedPoses, fit_s2r, simulate_poses
+from calib.fit.springs import fit_springs
 from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import sections
@@ -62,14 +60,8 @@ class StepResult(NamedTuple):
 Step = Callable[[Measurements, CalibratedArm, int], StepResult]
 
 
-def springs(
-    measurements: Measurements,
-    arm: CalibratedArm,
-    seed: int,
-    shared: bool = False,
-    fit_compensation: bool = False,
-) -> StepResult:
-    """Fit beta and delta of the springs' sensors; options as in `calib.fit.sensors.fit_springs`."""
+def springs(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
+    """Fit beta and delta of the springs' sensors."""
     spec = arm.spec
     pairs = [
         (readings, log.spring_m)
@@ -81,12 +73,9 @@ def springs(
         remedy = "beta and delta are not this arm's: log readings beside spring lengths on a ruler"
         return StepResult(arm, Section("Springs", needed, warnings=(remedy,)))
     readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
-    fit = fit_springs(readings, length_m, spec.spring_sensor, fit_compensation, shared, seed=seed)
+    fit = fit_springs(readings, length_m, spec.spring_sensor, seed)
     # Put the fitted numbers into the specification, and show the residuals.
-    sensor: dict[str, Any] = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
-    if fit.compensation_h is not None:
-        sensor["compensation_h"] = fit.compensation_h
-    spec = spec.replace(sensor=sensor)
+    spec = spec.replace(sensor={"beta": tuple(fit.slope.tolist()), "delta_m": tuple(fit.offset.tolist())})
     calibrated = spec.spring_sensor.lengths(readings, np.nan)
     section = sections.springs(fit, calibrated.length_m, length_m, spec.springs_per_section)
     return StepResult(arm._replace(spec=spec), section)
@@ -198,27 +187,6 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     widths_kg = payload_intervals(held.held, unloaded, largest_kg)
     section = sections.with_pressures(section, held, widths_kg, KNOWN * largest_kg)
     return StepResult(arm, section, pairs)
-
-
-def s2r_errors(measurements: Measurements, arm: CalibratedArm, seed: int = 0) -> dict[str, PoseErrors]:
-    """Return errors of tips at the held-out poses of a calibration's network.
-
-    Args:
-        measurements: measurements of the calibration, of all of its logs: others hold out other poses.
-        arm: calibrated arm, with its network.
-        seed: seed of the calibration.
-
-    Returns:
-        Errors of the simulated arm, of the paper's network fitted to the other poses, and of the arm's S2R.
-    """
-    _, _, settled, real, _ = _settled_poses(measurements, arm.spec)
-    held_out = held_out_blocks(len(real), block=block_rows(len(real)), seed=seed)
-    judged = settled.take(held_out)
-    printed = fit_printed(settled.take(~held_out), real[~held_out], seed)
-    poses = {"simulated": judged.pose, "as printed": moved(judged.pose, printed(judged))}
-    if arm.s2r is not None:
-        poses["calibrated"] = correct(arm.s2r, judged.pose, judged.spring_m)
-    return {name: pose_errors(np.asarray(pose, float), real[held_out]) for name, pose in poses.items()}
 
 
 class _SettledPoses(NamedTuple):

@@ -20,7 +20,7 @@ from calib.fit.parameters import BENDING, BOND, without_effect
 from calib.fit.payload import MOST_OFF, PayloadScaleFit
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
-from calib.fit.sensors import SpringFit
+from calib.fit.springs import LineFit
 from calib.report.page import ReportTable, Section, as_json, plain
 from mjx_softarm._support.fields import PerSection
 from mjx_softarm.pneumatics import Regulator
@@ -32,7 +32,7 @@ CHANGES, PAYLOADS = "Changes", "Payloads"
 ENOUGH = 2.0  # held-out error over that of the calibration, from which there is a warning; by hand
 
 
-def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
+def springs(fit: LineFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
     """Show beta and delta of each spring.
 
     Args:
@@ -42,16 +42,15 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_
         per_section: springs of a section, which are a row of the figure.
     """
     # Tabulate the fit.
-    half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
-    half_delta = 0.5 * np.ptp(fit.delta_interval_m, axis=1)
+    beta, delta_mm, held_out_mm = fit.slope, 1e3 * fit.offset, 1e3 * fit.held_out_rms
     rows = tuple(
-        (f"spring {k}", fit.beta[k], half_beta[k], 1e3 * fit.delta_m[k], 1e3 * half_delta[k])
-        + (1e3 * fit.held_out_rms_m[k], int(fit.n_rows[k]), int(fit.n_outliers[k]))
-        for k in range(len(fit.beta))
+        (f"spring {k}", beta[k], fit.slope_width[k], delta_mm[k], 1e3 * fit.offset_width[k])
+        + (held_out_mm[k], int(fit.n_rows[k]), int(fit.n_outliers[k]))
+        for k in range(len(beta))
     )
     head = ("", "beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
     # Draw the residuals of each spring.
-    n_rows = len(fit.beta) // per_section
+    n_rows = len(beta) // per_section
     figure = Figure(figsize=(7.5, 1.0 + 1.6 * n_rows), layout="constrained")
     each = figure.subplots(n_rows, per_section, sharex=True, sharey=True, squeeze=False)
     for k, axes in enumerate(each.flat):
