@@ -21,7 +21,7 @@ import numpy as np
 from calib import demo
 from calib.fit.blocks import held_out_blocks
 from calib.fit.chambers import fit_chambers
-from calib.fit.network import fit_network
+from calib.fit.s2r import fit_network
 from calib.fit.springs import fit_line, fit_springs
 from calib.read.logs import read_log
 from calib.read.measurements import measure as measurements_of

@@ -12,7 +12,7 @@ Statistics" (1981), section 7; clusters: Bell and McCaffrey, Survey Methodology 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -64,21 +64,17 @@ class Solution(NamedTuple):
         return QUANTILE * np.sqrt(np.diag(self.covariance))
 
 
-def fit(
-    model: Model, problem: Problem, rounds: Sequence[str] = ROUNDS, end: Mapping[str, Any] = TOLERANCES
-) -> Solution:
+def fit(model: Model, problem: Problem) -> Solution:
     """Minimise Huber's loss of the errors over their scales, started from x = 0.
 
     Args:
         model: errors and their Jacobian.
         problem: scales and prior.
-        rounds: losses, as SciPy names them.
-        end: end of a round, as SciPy has it.
     """
     model = _remembering(model)
     x, scale = np.zeros(len(problem.prior)), problem.scale
-    for loss in rounds:
-        x = descend(model, x, scale, problem, loss, end)
+    for loss in ROUNDS:
+        x = descend(model, x, scale, problem, loss, TOLERANCES)
         scale = _scales(model(x)[0], problem)
     return refine(model, x, problem)
 

@@ -11,7 +11,7 @@ import calib.demo
 from calib.__main__ import main
 from calib.arm import CalibratedArm
 from calib.demo import planted_arm, write_demo
-from calib.fit import network
+from calib.fit import s2r
 from calib.fit.payload import held_at
 from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
@@ -36,8 +36,8 @@ def calibrated(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("calib.fit.s2r.N_POINTS", 6_000)
-        schedule = network.OF_PROCESS.schedule._replace(n_updates=2_000)
-        patch.setattr(network, "OF_PROCESS", dataclasses.replace(network.OF_PROCESS, schedule=schedule))
+        schedule = s2r.OF_PROCESS.schedule._replace(n_updates=2_000)
+        patch.setattr(s2r, "OF_PROCESS", dataclasses.replace(s2r.OF_PROCESS, schedule=schedule))
         status = main(["run", *demo, "--out", str(folder)])
     return status, folder
 
@@ -172,8 +172,8 @@ def test_training_takes_the_folder(calibrated, trained_env, tmp_path):
     env, opened = trained_env(calibrated[1]), Run.open(tmp_path / "run")
     assert env.spec == opened.spec == ArmSpec.from_toml(calibrated[1] / "arm.toml")
     network = load_s2r(calibrated[1] / "s2r.npz", 9)
-    for s2r in (env.s2r, opened.arm.s2r):
-        np.testing.assert_array_equal(s2r.anchors, network.anchors)
+    for found in (env.s2r, opened.arm.s2r):
+        np.testing.assert_array_equal(found.anchors, network.anchors)
     plain = type(env)(env.spec, env.config)
     assert np.abs(env.pool.pose - plain.pool.pose)[:, :3].max() > 0.5
     np.testing.assert_array_equal(env.pool.spring_m, plain.pool.spring_m)
