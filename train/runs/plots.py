@@ -31,7 +31,6 @@ def pictures(
     if isinstance(result, AtPositions):
         return {
             "learning_curve.png": imitation_curve(rows),
-            "losses.png": losses(rows),
             "positions.png": positions_figure(result),
         }
     return {
@@ -174,17 +173,6 @@ def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
     left.set_ylim(0, 105)
     _evaluations(right, rows, 1, {"median_mm": (BLUE, "median"), "max_mm": (ORANGE, "largest")})
     logarithmic(right)
-    return figure
-
-
-def losses(rows: list[dict[str, Any]]) -> Figure:
-    """Draw all metrics of the learner that are losses over environment steps."""
-    names = list(dict.fromkeys(name for row in rows for name in row if name.endswith("loss")))
-    learned = [row for row in rows if row["updates"] > 0]
-    panels = [(name.split("/")[1].replace("_", " "), STEPS, "") for name in names]
-    figure, panels = _figure(4 * max(len(names), 1), *panels, height=3.5)
-    for name, axes in zip(names, panels, strict=True):
-        axes.plot([row["env_steps"] for row in learned], [row[name] for row in learned], color=BLUE)
     return figure
 
 
