@@ -13,7 +13,7 @@ With a sim-to-real network, poses and body are the real arm's, P_S2R; see `carry
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -99,7 +99,11 @@ def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmS
     ), wall_m
 
 
-@xla.jit_at_first_call(static_argnames=("spec", "pipe"))
+@functools.cache  # at the first use, since options are looked up on a device
+def _compiled(function: Callable) -> Callable:
+    return xla.jit(function, static_argnames=("spec", "pipe"))
+
+
 def look_many(
     pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None
 ) -> Posture:
@@ -107,7 +111,6 @@ def look_many(
     return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
 
 
-@xla.jit_at_first_call(static_argnames=("spec", "pipe"))
 def solve_many(
     starts_kpa: Array,
     target: PostureTarget,
@@ -191,7 +194,7 @@ class Expert:
     def __init__(self, spec: ArmSpec, s2r: S2R | None = None, pipe: CrossPipe | None = None, seed: int = 0):
         self.spec, self.pipe = spec, pipe
         arm = {"params": ArmParams.from_spec(spec), "s2r": s2r, "spec": spec, "pipe": pipe}
-        self._look, self._solve = (functools.partial(f, **arm) for f in (look_many, solve_many))
+        self._look, self._solve = (functools.partial(_compiled(f), **arm) for f in (look_many, solve_many))
         self._rng = np.random.default_rng(seed)
         pool = self.look(random_pressures(spec, N_POOL, self._rng))
         self._pool = jax.tree.map(lambda x: x[self._slack(pool).min(axis=-1) >= 0.0], pool)
