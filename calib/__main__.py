@@ -150,10 +150,10 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
         raise InputError("LOG: got nothing, expected one log or more")
     logs, findings = [], []
     for path in paths:
-        log, found = read_log(path, spec, strict)
+        log, of_log = read_log(path, spec, strict)
         logs.append(log)
-        findings += found
-        for finding in found:
+        findings += of_log
+        for finding in of_log:
             print(finding)
     return logs, findings
 

@@ -156,14 +156,17 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     With `printed` the network is the paper's, and the section shows the process beside it.
     """
     spec = arm.spec
-    found = _settled_poses(measurements, spec)
-    if len(found.rows) < MIN_S2R_POSES:
+    at_rest = _settled_poses(measurements, spec)
+    if len(at_rest.rows) < MIN_S2R_POSES:
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
-        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": found.n_unsettled}
-        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, len(found.rows), uses)}"
+        uses = {
+            **measurements.row_uses,
+            "poses at which the simulated arm finds no rest": at_rest.n_unsettled,
+        }
+        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, len(at_rest.rows), uses)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
         return StepResult(arm, Section("Sim-to-real network", needed, warnings=(remedy,)))
-    poses, rows, settled, real, n_unsettled = found
+    poses, rows, settled, real, n_unsettled = at_rest
     # Fit the network from simulated to measured tips.
     fit = fit_s2r(spec, settled, real, seed)
     others = (fit,) if printed else ()

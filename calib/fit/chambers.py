@@ -139,19 +139,19 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
     arm = with_numbers(x, params._replace(tool_mass_kg=masses))
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        found = settle_pressures(arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa))
-        frames = chain_kinematics(arm)(found.q)
-        turn = measured.tip_rotation.T @ found.tip_rotation
+        settled = settle_pressures(arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa))
+        frames = chain_kinematics(arm)(settled.q)
+        turn = measured.tip_rotation.T @ settled.tip_rotation
         end_m = _end_places(frames, marker_sites(x, arm))
     # Compare it with the measured pose.
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     error = [
-        found.tip_position_m - measured.tip_m,
+        settled.tip_position_m - measured.tip_m,
         angle,
-        found.spring_m - measured.spring_m,
+        settled.spring_m - measured.spring_m,
         (end_m - measured.end_m).reshape(-1),
     ]
-    return jnp.concatenate(error), found.residual
+    return jnp.concatenate(error), settled.residual
 
 
 def error_groups(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
@@ -271,7 +271,7 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
     change = (tolerances(spec)[:, None] * widths * directions)[:, unknown]
     weak_tip_mm = 1e3 * tip_changes(spec, solution.x, change)
     each = zip(widths[unknown], weak_tip_mm, directions.T[unknown], strict=True)
-    found = ChamberFit(
+    fit = ChamberFit(
         spec=calibrated,
         half_width_95=half_widths(calibrated, solution.covariance),
         direction_widths=widths,
@@ -289,7 +289,7 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
         warnings=(),
     )
-    return dataclasses.replace(found, warnings=complaints + _warnings(found, spec, solution))
+    return dataclasses.replace(fit, warnings=complaints + _warnings(fit, spec, solution))
 
 
 def _solutions(spec: ArmSpec, measured: Measured, held_out: np.ndarray) -> tuple[Solution, Solution]:
@@ -361,9 +361,9 @@ def _errors(error: np.ndarray, spec: ArmSpec) -> PoseErrors:
     return errors_of(tip_mm, np.degrees(np.arcsin(sine)), settled[:, 6 : 6 + spec.n_springs])
 
 
-def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:
+def _warnings(fit: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:
     # Look at the fit and its poses.
-    share, said = found.spec.chambers.bonded_share, []
+    share, said = fit.spec.chambers.bonded_share, []
     if share in BONDS:  # its derivative stays there, so that no fit converges
         evenly = "more" if share == max(BONDS) else "less"
         said.append(
@@ -372,19 +372,19 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
         )
     elif not solution.converged:
         said.append(NOT_CONVERGED)
-    if found.poses.n < ENOUGH_POSES:
-        said.append(f"got {found.poses.n} poses at rest, expected {ENOUGH_POSES} or more: log more poses")
-    if n_unsettled := np.count_nonzero(np.isnan(found.tip_error_mm)):
+    if fit.poses.n < ENOUGH_POSES:
+        said.append(f"got {fit.poses.n} poses at rest, expected {ENOUGH_POSES} or more: log more poses")
+    if n_unsettled := np.count_nonzero(np.isnan(fit.tip_error_mm)):
         said.append(
-            f"the simulated arm finds no rest at {n_unsettled} of {found.poses.n} poses: check payload and "
+            f"the simulated arm finds no rest at {n_unsettled} of {fit.poses.n} poses: check payload and "
             "pressures of these rows"
         )
-    if found.held_out.translation_mean_mm > MAX_RATIO * found.in_sample.translation_mean_mm:
+    if fit.held_out.translation_mean_mm > MAX_RATIO * fit.in_sample.translation_mean_mm:
         said.append(
-            f"held-out tip error {found.held_out.translation_mean_mm:.2f} mm is more than {MAX_RATIO:g} "
-            f"times the error of the others, {found.in_sample.translation_mean_mm:.2f} mm: log more poses"
+            f"held-out tip error {fit.held_out.translation_mean_mm:.2f} mm is more than {MAX_RATIO:g} "
+            f"times the error of the others, {fit.in_sample.translation_mean_mm:.2f} mm: log more poses"
         )
-    if not found.is_better:
+    if not fit.is_better:
         said.append("the specification itself is better on held-out poses, so it stays: log more poses")
     # Look at the fitted numbers.
     changes = by_name(solution.x, spec.structure)
@@ -395,15 +395,15 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
                 f"{name} of chambers {_list(far)} is {MAX_RATIO:g} times off the specification or more: "
                 "check the unit of pressure, the order of the columns, and the payload"
             )
-    if found.weak:
-        worth = f"{len(found.weak)} unknown directions, each worth up to {found.weak_tip_mm.max():.1f} mm"
-        springs = ", with spring lengths" if np.isnan(found.poses.spring_m).any() else ""
+    if fit.weak:
+        worth = f"{len(fit.weak)} unknown directions, each worth up to {fit.weak_tip_mm.max():.1f} mm"
+        springs = ", with spring lengths" if np.isnan(fit.poses.spring_m).any() else ""
         remedy = f"record more random poses{springs}"
-        said.append("\n  ".join([f"{worth}: {remedy}", *found.weak]))
+        said.append("\n  ".join([f"{worth}: {remedy}", *fit.weak]))
     # Look at the range of the pressures.
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     gap = MAX_PRESSURE_GAP * (high - low)
-    lowest, highest = found.poses.pressure_kpa.min(0), found.poses.pressure_kpa.max(0)
+    lowest, highest = fit.poses.pressure_kpa.min(0), fit.poses.pressure_kpa.max(0)
     if (short := np.flatnonzero((lowest > low + gap) | (highest < high - gap))).size:
         said.append(
             f"pressures of chambers {_list(short)} stay away from {low:g} or {high:g} kPa: log poses there"

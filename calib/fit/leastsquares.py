@@ -110,11 +110,11 @@ def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
         if solution.converged:
             break
         x = solution.x + solution.newton_step
-        found = model(x)
+        linearised = model(x)
         # Close to the minimum single precision hides changes of the loss, so the gradient decides.
-        if not _covariance(*found, x, solution.scale, problem)[2] < solution.decrement:
+        if not _covariance(*linearised, x, solution.scale, problem)[2] < solution.decrement:
             break
-        solution = solution_at(x, *found, problem)
+        solution = solution_at(x, *linearised, problem)
     return solution
 
 
@@ -193,10 +193,10 @@ def _covariance(
 
 def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:
     """Return the robust standard deviation of each group (n_groups,)."""
-    found = problem.scale.copy()
-    for k in range(len(found)):
+    scale = problem.scale.copy()
+    for k in range(len(scale)):
         of_group = error[np.broadcast_to(problem.group == k, error.shape)]
         of_group = of_group[np.isfinite(of_group)]
         if len(of_group):
-            found[k] = max(SIGMA_PER_MEDIAN * np.median(np.abs(of_group)), problem.min_scale[k])
-    return found
+            scale[k] = max(SIGMA_PER_MEDIAN * np.median(np.abs(of_group)), problem.min_scale[k])
+    return scale

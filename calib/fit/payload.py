@@ -72,8 +72,8 @@ class PayloadPoses(NamedTuple):
 
 def payload_poses(arm: CalibratedArm, n: int = N_POSES, seed: int = SEED) -> PayloadPoses:
     """Return poses at n random pressures, without those at which the arm does not settle."""
-    found = settle_many(arm.spec, random_pressures(arm.spec, n, seed))
-    at, both = held_at(arm, np.asarray(found.spring_m)[found.settled])
+    settled = settle_many(arm.spec, random_pressures(arm.spec, n, seed))
+    at, both = held_at(arm, np.asarray(settled.spring_m)[settled.settled])
     return PayloadPoses(*(values[both] for values in at))
 
 
@@ -159,8 +159,8 @@ def estimated_payload(
     (at, _), held = held_at(arm, spring_m), arm.held
     if held is None:
         raise ValueError("arm.held: got None, expected residual pressures")
-    effect, found = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
-    left_kpa = pressure_kpa - at.pressure_kpa - found.mean_kpa.reshape(effect.shape)
+    effect, predicted = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
+    left_kpa = pressure_kpa - at.pressure_kpa - predicted.mean_kpa.reshape(effect.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
     for _ in range(N_PASSES):
         weight = np.linalg.solve(_covariance(held, at, payload_kg), effect[..., None])[..., 0]
@@ -212,5 +212,5 @@ def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -
     """Return covariances (m, n, n) [kPa^2] of the pressures that hold arms with payloads (m,) [kg]."""
     effect = payload_kg[:, None] * at.effect_kpa_per_kg
     share = residual(held, at.spring_m, at.pressure_kpa).share
-    own = factor_covariance(held, effect.shape[1])
-    return covariances(held, share) + effect[:, :, None] * own * effect[:, None]
+    of_factor = factor_covariance(held, effect.shape[1])
+    return covariances(held, share) + effect[:, :, None] * of_factor * effect[:, None]

@@ -345,19 +345,19 @@ def moved(pose: np.ndarray, change: np.ndarray) -> np.ndarray:
 
 def _points(spec: ArmSpec, model: Model, spring_m: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs of the network and answers of a model, at rows of springs and all over the workspace."""
-    found = settle_many(spec, random_pressures(spec, N_POINTS, seed))
-    over = np.clip(found.spring_m[found.settled], spring_m.min(axis=0), spring_m.max(axis=0))
+    drawn = settle_many(spec, random_pressures(spec, N_POINTS, seed))
+    over = np.clip(drawn.spring_m[drawn.settled], spring_m.min(axis=0), spring_m.max(axis=0))
     simulated = simulate_poses(spec, np.concatenate([spring_m, over]))
     settled = simulated.take(simulated.valid)
     return inputs(frame_from_pose(settled.pose), settled.spring_m), model(settled)
 
 
 def _warnings(n: int, turn_deg: np.ndarray, errors: dict[str, PoseErrors]) -> list[str]:
-    found = []
+    warnings = []
     if n < MIN_ROWS:
-        found.append(f"got {n} rows, expected {MIN_ROWS} or more for a network: log more poses")
+        warnings.append(f"got {n} rows, expected {MIN_ROWS} or more for a network: log more poses")
     if rows := np.count_nonzero(turn_deg > MAX_TURN_DEG):
-        found.append(
+        warnings.append(
             f"in {rows} of {n} rows the real tip is turned by more than {MAX_TURN_DEG:g} degrees against the "
             "simulated one: bring motion capture into the base frame"
         )
@@ -369,7 +369,7 @@ def _warnings(n: int, turn_deg: np.ndarray, errors: dict[str, PoseErrors]) -> li
         if got >= without:
             left_out = ", so it is left out" if what == "translation" else ""
             better = f"no better than {without:.3g} without the network{left_out}"
-            found.append(f"{held_out}, {better}: log more poses")
+            warnings.append(f"{held_out}, {better}: log more poses")
         if got > max(MAX_HELD_OUT_RATIO * seen, GOOD_SHARE * without):
-            found.append(f"{held_out}, far more than {seen:.3g} in training: log more poses")
-    return found
+            warnings.append(f"{held_out}, far more than {seen:.3g} in training: log more poses")
+    return warnings

@@ -104,7 +104,7 @@ def fit_line(x: np.ndarray, y: np.ndarray, seed: int = 0) -> LineFit:
     held_out, beyond = _held_out(x, parts[1:], fold, slopes[1:], offsets[1:])
     # Compare all rows with the lines.
     residual = y - slope * x - offset
-    found = LineFit(
+    fit = LineFit(
         slope=slope,
         offset=offset,
         slope_width=slope_width,
@@ -116,7 +116,7 @@ def fit_line(x: np.ndarray, y: np.ndarray, seed: int = 0) -> LineFit:
         n_rows=known.sum(0),
         n_outliers=(np.abs(residual) > DOWN_WEIGHTED * noise).sum(0),
     )
-    return found._replace(warnings=_warnings(found, np.nanstd(x, axis=0)))
+    return fit._replace(warnings=_warnings(fit, np.nanstd(x, axis=0)))
 
 
 def _held_out(
@@ -259,7 +259,7 @@ def _stretches(table: np.ndarray) -> np.ndarray:
 
 def _warnings(fit: LineFit, spread: np.ndarray) -> tuple[str, ...]:
     """Return reasons not to trust lines of predictors with standard deviations (k,), each with its remedy."""
-    found = []
+    warnings = []
     for k in range(len(fit.slope)):
         n, held_out, noise, rms = fit.n_rows[k], fit.held_out_rms[k], fit.noise[k], fit.rms[k]
         range_y = abs(fit.slope[k]) * spread[k]
@@ -279,5 +279,5 @@ def _warnings(fit: LineFit, spread: np.ndarray) -> tuple[str, ...]:
             f"{fit.n_outliers[k]} of {n} rows are outliers of a straight line: look for lengths of another "
             "spring or another time": fit.n_outliers[k] > 0.1 * n,
         }
-        found += [f"spring{k}: {reason}" for reason, holds in reasons.items() if holds]
-    return tuple(found)
+        warnings += [f"spring{k}: {reason}" for reason, holds in reasons.items() if holds]
+    return tuple(warnings)

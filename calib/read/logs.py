@@ -60,8 +60,8 @@ def read_log(
     matrix, findings = read_matrix(path, spec, one_of=NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
         refuse(implausible(matrix, spec))
-        matrix, found = clean(matrix)
-    findings += found
+        matrix, cleaning = clean(matrix)
+    findings += cleaning
     if strict:
         refuse(findings)
     return matrix.log(), findings

@@ -236,9 +236,9 @@ def with_pressures(
 def actuators(fit: ActuatorFit) -> Section:
     """Show the numbers of the actuators and the errors of the pressures."""
     # A row for each chamber: its numbers, with intervals where they were fitted, and its error
-    found, n = fit.spec.actuators, fit.spec.n_chambers
-    each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(found).items()}
-    widths = fit.half_width_95 if isinstance(found, Regulator) else {}
+    kept, n = fit.spec.actuators, fit.spec.n_chambers
+    each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(kept).items()}
+    widths = fit.half_width_95 if isinstance(kept, Regulator) else {}
     rows = []
     for k in range(n):
         pairs = ((value[k], widths[name][k]) if widths else (value[k],) for name, value in each.items())
@@ -260,14 +260,14 @@ def actuators(fit: ActuatorFit) -> Section:
     return Section(
         "Actuators",
         f"{fit.n_tracks} tracks of commands and pressures, {fit.time_s:.0f} s in all: "
-        f"{found.kind}s driven with the commands against the {against}. Intervals are 95 %. "
+        f"{kept.kind}s driven with the commands against the {against}. Intervals are 95 %. "
         f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s). {_kept(fit)}",
         (
             ReportTable(("", *titles, "held-out RMS [kPa]"), tuple(rows)),
             ReportTable(("pressures", "RMS [kPa]"), errors),
         ),
         fit.warnings,
-        plain(fit, "spec", "notes") | {"kind": found.kind, "values": as_json(dataclasses.asdict(found))},
+        plain(fit, "spec", "notes") | {"kind": kept.kind, "values": as_json(dataclasses.asdict(kept))},
         notes=fit.notes,
     )
 
@@ -322,23 +322,23 @@ def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
     )
 
 
-def changes(found: Changes, known_mm: float) -> Section:
+def changes(fit: Changes, known_mm: float) -> Section:
     """Show what has changed, and whether that explains the later poses.
 
     Args:
-        found: fitted changes.
+        fit: fitted changes.
         known_mm: mean error of the tip at held-out poses of the calibration, 0 if not known.
     """
     # Tables of the springs, the chambers and the errors
-    springs = _rows("spring", 1e3 * found.zero_m, 1e3 * found.zero_half_width_m)
-    chambers = _rows("chamber", 100 * found.stiffness, found.offset_kpa)
+    springs = _rows("spring", 1e3 * fit.zero_m, 1e3 * fit.zero_half_width_m)
+    chambers = _rows("chamber", 100 * fit.stiffness, fit.offset_kpa)
     errors = tuple(
         (what, tip.translation_mean_mm, tip.rotation_mean_deg, kpa)
         if tip.n
         else (what, "not measured", "not measured", kpa)
         for what, tip, kpa in (
-            ("before", found.before, found.before_kpa),
-            ("with the changes", found.after, found.after_kpa),
+            ("before", fit.before, fit.before_kpa),
+            ("with the changes", fit.after, fit.after_kpa),
         )
     )
     tables = (
@@ -349,7 +349,7 @@ def changes(found: Changes, known_mm: float) -> Section:
 
     # A sentence for the terminal, and a warning where more has changed
     warnings: tuple[str, ...] = ()
-    after_mm = found.after.translation_mean_mm if found.is_better else found.before.translation_mean_mm
+    after_mm = fit.after.translation_mean_mm if fit.is_better else fit.before.translation_mean_mm
     if known_mm and after_mm > ENOUGH * known_mm:
         warnings = (
             f"{after_mm:.1f} mm remain at held-out poses, {known_mm:.1f} mm at the calibration: more has "
@@ -357,50 +357,50 @@ def changes(found: Changes, known_mm: float) -> Section:
         )
     return Section(
         CHANGES,
-        f"{found.n} later poses of the unloaded arm against the calibrated simulation. Zeros are true "
+        f"{fit.n} later poses of the unloaded arm against the calibrated simulation. Zeros are true "
         "lengths minus lengths read. A stiffness and an offset of the pressures differ to some per cent. "
         "Intervals are 95 %; contiguous blocks of poses are held out.",
         tables,
         warnings,
-        plain(found, "spec") | {"is_better": found.is_better},
-        notes=(_sentence(found),),
+        plain(fit, "spec") | {"is_better": fit.is_better},
+        notes=(_sentence(fit),),
     )
 
 
-def payloads(found: PayloadScaleFit) -> Section:
+def payloads(fit: PayloadScaleFit) -> Section:
     """Show how strongly the arm feels payloads, by poses with a known weight."""
-    estimate = f"{found.n} poses with a known weight gave {found.ratio:.3f} of it in the mean"
-    if not found.is_plausible:
+    estimate = f"{fit.n} poses with a known weight gave {fit.ratio:.3f} of it in the mean"
+    if not fit.is_plausible:
         expected = f"expected {1.0 - MOST_OFF:.1f} to {1.0 + MOST_OFF:.1f}"
         remedy = "check the weight and its unit, and whether the arm has changed since the calibration"
         warning = f"{estimate}, {expected}: {remedy}"
-        return Section(PAYLOADS, f"{estimate}.", warnings=(warning,), data=found._asdict())
-    percent = 100.0 * QUANTILE * found.factor_sd
+        return Section(PAYLOADS, f"{estimate}.", warnings=(warning,), data=fit._asdict())
+    percent = 100.0 * QUANTILE * fit.factor_sd
     text = (
-        f"{estimate}. So a payload changes the pressures by {found.factor:.3f} of the simulated change. Near "
+        f"{estimate}. So a payload changes the pressures by {fit.factor:.3f} of the simulated change. Near "
         f"these poses this factor is known to {percent:.0f} % (95 %); other errors add to it."
     )
-    off = 100.0 * (found.ratio - 1.0)
+    off = 100.0 * (fit.ratio - 1.0)
     note = (
         f"payloads were estimated {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
     )
-    return Section(PAYLOADS, text, data=found._asdict(), notes=(note,))
+    return Section(PAYLOADS, text, data=fit._asdict(), notes=(note,))
 
 
 def _rows(name: str, *columns: np.ndarray) -> tuple[tuple[Any, ...], ...]:
     return tuple((f"{name} {k}", *map(float, row)) for k, row in enumerate(zip(*columns, strict=True)))
 
 
-def _sentence(found: Changes) -> str:
-    if not found.is_better:
+def _sentence(fit: Changes) -> str:
+    if not fit.is_better:
         return "nothing has changed that these poses show: the calibration stays as it is"
-    zero_mm = ", ".join(f"{x:+.1f}" for x in 1e3 * found.zero_m)
-    mean, half = 100 * found.stiffness.mean(), 100 * found.mean_half_width
+    zero_mm = ", ".join(f"{x:+.1f}" for x in 1e3 * fit.zero_m)
+    mean, half = 100 * fit.stiffness.mean(), 100 * fit.mean_half_width
     what = f"zeros of the springs {zero_mm} mm; stiffness of the chambers {mean:+.0f} +- {half:.0f} %"
-    if not found.before.n:  # no motion capture
-        off = f"{found.before_kpa:.2f} kPa off before, {found.after_kpa:.2f} now"
+    if not fit.before.n:  # no motion capture
+        off = f"{fit.before_kpa:.2f} kPa off before, {fit.after_kpa:.2f} now"
         return f"{what}; pressures at held-out poses {off}"
-    before_mm, after_mm = found.before.translation_mean_mm, found.after.translation_mean_mm
+    before_mm, after_mm = fit.before.translation_mean_mm, fit.after.translation_mean_mm
     return f"{what}; tips at held-out poses {before_mm:.1f} mm off before, {after_mm:.1f} mm now"
 
 

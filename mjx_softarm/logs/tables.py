@@ -71,8 +71,8 @@ def _read_csv(path: Path) -> Table:
     first = head.decode("utf-8-sig", errors="replace").splitlines()[0]
     names = tuple(name.strip() for name in first.split(","))
     if "," not in first:
-        found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
-        got = f"{found[0]} between the columns" if found else f"one column, {first[:60]!r}"
+        delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
+        got = f"{delimiters[0]} between the columns" if delimiters else f"one column, {first[:60]!r}"
         raise _error(path, f"got {got}, expected columns parted by commas, and decimal points", 1)
     # Lines: blank ones are skipped, empty cells are NaN, any other text is an error.
     values, row = [], []
@@ -122,6 +122,6 @@ def _check_text(path: Path, head: bytes) -> None:
 
 
 def _ragged(line: str, n_cells: int, n_names: int) -> str:
-    found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
-    hint = f" and {found[0]}" if found else " (decimal commas?)" if n_cells >= 1.5 * n_names else ""
+    delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
+    hint = f" and {delimiters[0]}" if delimiters else " (decimal commas?)" if n_cells >= 1.5 * n_names else ""
     return f"got {n_cells} cells{hint}, expected {n_names} as in the header"

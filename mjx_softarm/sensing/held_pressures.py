@@ -81,12 +81,12 @@ def held_kpa(
         effect_kpa (m, n_chambers) [kPa]: simulated change of these pressures by the arm's payload.
         rng: generator of residuals and factors for each arm; without one, means are returned.
     """
-    found = residual(held, spring_m, light_kpa)
-    left_kpa, relative = found.mean_kpa, np.ones_like(light_kpa)
+    predicted = residual(held, spring_m, light_kpa)
+    left_kpa, relative = predicted.mean_kpa, np.ones_like(light_kpa)
     if rng is not None:
         root, (m, n) = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
         normal = rng.standard_normal(left_kpa.shape)
-        left_kpa = left_kpa + np.sqrt(found.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
+        left_kpa = left_kpa + np.sqrt(predicted.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
         relative = rng.multivariate_normal(np.ones(n), factor_covariance(held, n), m)
     return light_kpa + left_kpa.reshape(light_kpa.shape) + held.factor * relative * effect_kpa
 
@@ -120,8 +120,8 @@ def residual(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray
         factor = cho_factor(kernel(rows, rows, length) + held.noise[s] * np.eye(len(rows)), lower=True)
         across = kernel(rows, state[:, s], length)  # (n, m)
         mean[:, s] = across.T @ cho_solve(factor, held.residual_kpa[:, s])
-        own = 2.0 + np.sum(state[:, s] ** 2, axis=1)
-        share[:, s] = own - np.sum(across * cho_solve(factor, across), axis=0) + held.noise[s]
+        prior = 2.0 + np.sum(state[:, s] ** 2, axis=1)
+        share[:, s] = prior - np.sum(across * cho_solve(factor, across), axis=0) + held.noise[s]
     return Residual(mean, np.maximum(share, held.noise))
 
 
@@ -130,9 +130,9 @@ def covariances(held: HeldPressures, share: np.ndarray) -> np.ndarray:
     m, s = share.shape
     blocks = share[:, :, None, None] * held.covariance_kpa2
     c = blocks.shape[-1]
-    found = np.zeros((m, s, c, s, c))
-    found[:, np.arange(s), :, np.arange(s)] = np.swapaxes(blocks, 0, 1)
-    return found.reshape(m, s * c, s * c)
+    matrix = np.zeros((m, s, c, s, c))
+    matrix[:, np.arange(s), :, np.arange(s)] = np.swapaxes(blocks, 0, 1)
+    return matrix.reshape(m, s * c, s * c)
 
 
 def save_pressures(path: Path, held: HeldPressures) -> None:

@@ -34,7 +34,7 @@ def stop_after(stop: Array, moved_m: Array, stroke_m: Array) -> Array:
 
 def stops(length_m: np.ndarray, stroke_m: np.ndarray) -> np.ndarray:
     """Return the states (m, n) at lengths (m, n) [m] that follow each other; the first ones are 0."""
-    found = np.zeros_like(length_m)
+    stop_m = np.zeros_like(length_m)
     for k in range(1, len(length_m)):
-        found[k] = stop_after(found[k - 1], length_m[k] - length_m[k - 1], stroke_m)
-    return found
+        stop_m[k] = stop_after(stop_m[k - 1], length_m[k] - length_m[k - 1], stroke_m)
+    return stop_m

@@ -132,8 +132,8 @@ class Stage:
         """Colour the bellows; send a message only if the colours change."""
         if self._marked is None or not np.array_equal(saturated, self._marked):
             self._marked = saturated
-            own = np.array(section_colours(len(saturated), self._limits.n_sections))
-            colour = np.where(saturated[:, None], SATURATED, own).astype(np.uint8)
+            colours = np.array(section_colours(len(saturated), self._limits.n_sections))
+            colour = np.where(saturated[:, None], SATURATED, colours).astype(np.uint8)
             self._folds.batched_colors = np.repeat(colour, FOLDS, axis=0)
 
 
