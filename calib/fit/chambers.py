@@ -74,11 +74,9 @@ class ChamberFit:
     weak_tip_mm: np.ndarray  # largest movement of the tip along each unknown direction, within its interval
     in_sample: PoseErrors  # errors of the first fit at its own poses
     held_out: PoseErrors  # errors of the first fit at held-out poses
-    in_sample_before: PoseErrors  # errors of the specification
-    held_out_before: PoseErrors  # errors of the specification
+    held_out_before: PoseErrors  # errors of the specification there
     scale: np.ndarray  # (2, 3 or 4) robust errors of bent and straight arms, by `SCALE`
     rows: Mapping[str, int]  # number of rows of the logs, by use
-    n_single: int  # poses of one row, which cannot show whether the tip moved
     poses: StaticPoses  # in the order of the logs
     is_held_out: np.ndarray  # (n,) bool
     tip_error_mm: np.ndarray  # (n,) tip error of the first fit; NaN where the arm did not settle
@@ -277,13 +275,11 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
         direction_widths=widths,
         weak=tuple(_describe(*numbers, names(spec)) for numbers in each),
         weak_tip_mm=weak_tip_mm,
-        in_sample=_errors(after[~held_out], spec),
-        held_out=_errors(after[held_out], spec),
-        in_sample_before=_errors(before[~held_out], spec),
-        held_out_before=_errors(before[held_out], spec),
+        in_sample=_errors(after[~held_out]),
+        held_out=_errors(after[held_out]),
+        held_out_before=_errors(before[held_out]),
         scale=np.stack([bent, np.minimum(bent, straight)])[:, : 4 if np.isfinite(end_m).any() else 3],
         rows=measurements.row_uses,
-        n_single=int(np.count_nonzero(poses.n_rows == 1)),
         poses=poses,
         is_held_out=held_out,
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
@@ -354,11 +350,12 @@ def _describe(width: float, tip_mm: float, vector: np.ndarray, names: Sequence[s
     return f"known to {width:.2f} times the tolerance, the tip to {tip_mm:.1f} mm: {' '.join(components)}"
 
 
-def _errors(error: np.ndarray, spec: ArmSpec) -> PoseErrors:
+def _errors(error: np.ndarray) -> PoseErrors:
+    """Sum up the errors (n, ...) of the tips of arms that settled."""
     settled = error[~np.isinf(error[:, 0])].reshape(-1, error.shape[1])
     sine = np.minimum(np.linalg.norm(settled[:, 3:6], axis=1), 1.0)
     tip_mm = 1e3 * np.linalg.norm(settled[:, :3], axis=1)
-    return errors_of(tip_mm, np.degrees(np.arcsin(sine)), settled[:, 6 : 6 + spec.n_springs])
+    return errors_of(tip_mm, np.degrees(np.arcsin(sine)))
 
 
 def _warnings(fit: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:

@@ -18,7 +18,6 @@ from mjx_softarm.spec import BONDS
 from tests.arms import OTHER_ARMS
 from tests.calib.fit.planted import (
     SPEC,
-    SPRING_NOISE_M,
     TIP_NOISE_M,
     calibrate_chambers,
     off_by,
@@ -188,7 +187,6 @@ def test_held_out_error_is_that_of_the_noise(fitted):
     assert fitted.held_out.n == fitted.is_held_out.sum() == 40
     assert 1.0 < fitted.held_out.translation_mean_mm / (1e3 * 1.6 * TIP_NOISE_M) < 1.5
     assert fitted.held_out_before.translation_mean_mm > 5.0
-    assert fitted.held_out.spring_rms_mm == pytest.approx(1e3 * SPRING_NOISE_M, rel=0.2)
 
 
 def test_intervals_hold_the_planted_numbers_as_often_as_they_say():
@@ -226,7 +224,6 @@ def test_outliers_hardly_matter():
 
 def test_every_row_is_counted_and_held_out_poses_are_contiguous(fitted):
     assert {use: n for use, n in fitted.rows.items() if n} == {"used": 200}
-    assert fitted.n_single == 200
     np.testing.assert_array_equal(fitted.is_held_out, held_out_blocks(200, 5, 0))
     commanded = fitted.spec.springs.length_min_m, fitted.spec.springs.length_max_m
     assert commanded == (np.nanmin(fitted.poses.spring_m), np.nanmax(fitted.poses.spring_m))
