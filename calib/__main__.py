@@ -88,8 +88,6 @@ def _run(
     strict: Strict = False,
     out: Path = Path("calibration"),
     since: cli.MaybePath = None,
-    shared_springs: bool = False,
-    fit_compensation: bool = False,
     s2r: Literal["process", "printed"] = "process",
     seed: int = 0,
 ) -> int:
@@ -99,8 +97,6 @@ def _run(
         out: folder to write
         since: calibration that goes on: the logs are later ones, and show what has changed and how payloads
             are felt, nothing else
-        shared_springs: fit one beta and one delta for all springs
-        fit_compensation: fit the circuit's compensation inductance, too
         s2r: sim-to-real network: ours, which learns a Gaussian process, or the paper's as printed
         seed: seed of all random draws
     """
@@ -115,27 +111,15 @@ def _run(
     refuse_existing(out)
     if since and spec:
         raise InputError(f"--spec: got {spec} and --since {since}, which has its own, expected one")
-    options = {
-        "--shared-springs": shared_springs,
-        "--fit-compensation": fit_compensation,
-        "--s2r": s2r != "process",
-    }
-    for option, given in options.items():
-        if since and given:
-            raise InputError(
-                f"{option}: got --since {since}, whose springs and S2R stay, expected one of them"
-            )
+    if since and s2r != "process":
+        raise InputError(f"--s2r: got --since {since}, whose S2R stays, expected one of them")
     known = load_calibration(since) if since else None
     arm = known.arm.spec if known else ArmSpec.of(spec)
     if not (spec or since):
         print(f"arm: {arm.name}, by default; --spec names another arm")
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
-    chosen = dict(steps.STEPS)
-    chosen["springs"] = functools.partial(
-        steps.springs, shared=shared_springs, fit_compensation=fit_compensation
-    )
-    chosen["sim-to-real network"] = functools.partial(steps.s2r, printed=s2r == "printed")
+    chosen = {**steps.STEPS, "sim-to-real network": functools.partial(steps.s2r, printed=s2r == "printed")}
     progress = functools.partial(print, flush=True)
     calibration = (
         go_on(known, read, seed, progress) if known else calibrate(read, arm, seed, chosen, progress)
@@ -166,10 +150,10 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
         raise InputError("LOG: got nothing, expected one log or more")
     logs, findings = [], []
     for path in paths:
-        log, found = read_log(path, spec, strict)
+        log, of_log = read_log(path, spec, strict)
         logs.append(log)
-        findings += found
-        for finding in found:
+        findings += of_log
+        for finding in of_log:
             print(finding)
     return logs, findings
 

@@ -76,12 +76,12 @@ def fit_changes(arm: CalibratedArm, poses: StaticPoses, seed: int = 0) -> Change
     """
     # A fit without the held-out poses, which judge it, then to all poses
     held_out = held_out_blocks(poses.n, block=HELD_OUT_BLOCK, seed=seed)
-    judged, found = (_fit(arm, poses.take(rows)) for rows in (~held_out, held_out | True))
+    judged, fit = (_fit(arm, poses.take(rows)) for rows in (~held_out, held_out | True))
     before, after = (_model(arm, poses.take(held_out), x)[0] for x in (0.0 * judged.x, judged.x))
 
     # The arm as it is now
     spec, n, n_chambers = arm.spec, arm.spec.n_springs, arm.spec.n_chambers
-    zero_m, (stiffness, offset_kpa) = found.x[:n], found.x[n:].reshape(2, -1) @ _all_and_each(n_chambers).T
+    zero_m, (stiffness, offset_kpa) = fit.x[:n], fit.x[n:].reshape(2, -1) @ _all_and_each(n_chambers).T
     old = np.array(spec.per_chamber(spec.chambers.stiffness_n_per_m))
     mean = np.repeat([0.0, 1.0, 1.0 / n_chambers, 0.0], [n, 1, n_chambers, 1 + n_chambers])
     # On twins the loop's arrivals need 0.3 kPa less than recorded poses: all stiffnesses may be off by that
@@ -94,10 +94,10 @@ def fit_changes(arm: CalibratedArm, poses: StaticPoses, seed: int = 0) -> Change
             unmodelled={"pressure_kpa": tuple(map(float, unmodelled))},
         ),
         zero_m=zero_m,
-        zero_half_width_m=found.half_width[:n],
+        zero_half_width_m=fit.half_width[:n],
         stiffness=stiffness,
         offset_kpa=offset_kpa,
-        mean_half_width=QUANTILE * float(np.sqrt(mean @ found.covariance @ mean + shared**2)),
+        mean_half_width=QUANTILE * float(np.sqrt(mean @ fit.covariance @ mean + shared**2)),
         n=poses.n,
         before=_pose_errors(before),
         after=_pose_errors(after),
@@ -128,19 +128,19 @@ def _model(arm: CalibratedArm, poses: StaticPoses, x: np.ndarray) -> tuple[np.nd
     n, m = spec.n_springs, poses.n
     shift_m = x[:n] + STEP_M * np.concatenate([np.zeros((1, n)), np.eye(n)])  # (1 + n, n)
     spring_m = (poses.spring_m + shift_m[:, None]).reshape(-1, n)
-    found = simulate_poses(spec, spring_m)
-    pose = found.pose if s2r is None else correct(s2r, found.pose, found.spring_m)
+    simulated = simulate_poses(spec, spring_m)
+    pose = simulated.pose if s2r is None else correct(s2r, simulated.pose, simulated.spring_m)
 
     # Errors of tips and pressures
     real = np.tile(pose_from_frame(poses.tip_m, poses.tip_rotation), (1 + n, 1))
     tip = correction_between(real, np.asarray(pose, float)) * _TURN
     measured_kpa = without_redundant_part(np.tile(poses.pressure_kpa, (1 + n, 1)), spring_m, spec)
-    simulated_kpa = np.asarray(found.pressure_kpa, float)
+    simulated_kpa = np.asarray(simulated.pressure_kpa, float)
     if held is not None:
         simulated_kpa = held_kpa(held, spring_m, simulated_kpa, np.zeros_like(simulated_kpa))
     left_kpa = measured_kpa - simulated_kpa - spec.unmodelled_kpa
     error = np.concatenate([tip, left_kpa], axis=1)
-    error = np.where(found.valid[:, None], error, np.inf).reshape(1 + n, m, -1)
+    error = np.where(simulated.valid[:, None], error, np.inf).reshape(1 + n, m, -1)
 
     # Their derivatives, and the parts of the stiffness and of the offsets
     elastic = _elastic_kpa(spec, spring_m[:m])[..., None]  # (m, n_chambers, 1)

@@ -104,9 +104,9 @@ def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
 def _poses(arm: ArmSpec, rng: np.random.Generator) -> Log:
     pressure_kpa = random_pressures(arm, N_POSES, rng)
     model = build_model(arm)
-    data, found = mujoco.MjData(model), settle_many(arm, pressure_kpa)
-    seen = [_look(arm, model, data, q) for q in found.q[found.settled]]
-    pressure_kpa = np.asarray(found.pressure_kpa)[found.settled]
+    data, settled = mujoco.MjData(model), settle_many(arm, pressure_kpa)
+    seen = [_look(arm, model, data, q) for q in settled.q[settled.settled]]
+    pressure_kpa = np.asarray(settled.pressure_kpa)[settled.settled]
     return _measured(arm, POSE_S * np.arange(len(seen)), pressure_kpa, seen, rng)
 
 

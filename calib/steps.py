@@ -9,17 +9,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from calib.arm import CalibratedArm
 from calib.changes import MIN_POSES as MIN_LATER
 from calib.changes import fit_changes
-from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
-from calib.fit.markers import MIN_MARKERS, marker_limits
 from calib.fit.motion.actuators import MEASURED, ArmLag, fit_actuators
 from calib.fit.motion.damping import PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
@@ -32,9 +30,8 @@ from calib.fit.payload import (
     payload_intervals,
     payload_poses,
 )
-from calib.fit.pose_errors import PoseErrors, pose_errors
-from calib.fit.s2r import SimulatedPoses, fit_printed, fit_s2r, moved, simulate_poses
-from calib.fit.sensors import fit_springs
+from calib.fit.s2r import SimulatedPoses, fit_s2r, simulate_poses
+from calib.fit.springs import fit_springs
 from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import sections
@@ -63,14 +60,8 @@ class StepResult(NamedTuple):
 Step = Callable[[Measurements, CalibratedArm, int], StepResult]
 
 
-def springs(
-    measurements: Measurements,
-    arm: CalibratedArm,
-    seed: int,
-    shared: bool = False,
-    fit_compensation: bool = False,
-) -> StepResult:
-    """Fit beta and delta of the springs' sensors; options as in `calib.fit.sensors.fit_springs`."""
+def springs(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
+    """Fit beta and delta of the springs' sensors."""
     spec = arm.spec
     pairs = [
         (readings, log.spring_m)
@@ -82,12 +73,9 @@ def springs(
         remedy = "beta and delta are not this arm's: log readings beside spring lengths on a ruler"
         return StepResult(arm, Section("Springs", needed, warnings=(remedy,)))
     readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
-    fit = fit_springs(readings, length_m, spec.spring_sensor, fit_compensation, shared, seed=seed)
+    fit = fit_springs(readings, length_m, spec.spring_sensor, seed)
     # Put the fitted numbers into the specification, and show the residuals.
-    sensor: dict[str, Any] = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
-    if fit.compensation_h is not None:
-        sensor["compensation_h"] = fit.compensation_h
-    spec = spec.replace(sensor=sensor)
+    spec = spec.replace(sensor={"beta": tuple(fit.slope.tolist()), "delta_m": tuple(fit.offset.tolist())})
     calibrated = spec.spring_sensor.lengths(readings, np.nan)
     section = sections.springs(fit, calibrated.length_m, length_m, spec.springs_per_section)
     return StepResult(arm._replace(spec=spec), section)
@@ -101,11 +89,7 @@ def chambers(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
         remedy = f"stiffness, area and length are not this arm's: log {MIN_POSES} poses at rest or more"
         return StepResult(arm, Section("Chambers", needed, warnings=(remedy,)))
     fit = fit_chambers(measurements, arm.spec, seed)
-    section = sections.chambers(fit)
-    # Check the chambers' lengths by markers along the arm.
-    if fit.has_markers and fit.poses.marker_m.shape[1] >= MIN_MARKERS:
-        section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
-    return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, section)
+    return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, sections.chambers(fit))
 
 
 def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
@@ -172,14 +156,17 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     With `printed` the network is the paper's, and the section shows the process beside it.
     """
     spec = arm.spec
-    found = _settled_poses(measurements, spec)
-    if len(found.rows) < MIN_S2R_POSES:
+    at_rest = _settled_poses(measurements, spec)
+    if len(at_rest.rows) < MIN_S2R_POSES:
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
-        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": found.n_unsettled}
-        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, len(found.rows), uses)}"
+        uses = {
+            **measurements.row_uses,
+            "poses at which the simulated arm finds no rest": at_rest.n_unsettled,
+        }
+        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, len(at_rest.rows), uses)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
         return StepResult(arm, Section("Sim-to-real network", needed, warnings=(remedy,)))
-    poses, rows, settled, real, n_unsettled = found
+    poses, rows, settled, real, n_unsettled = at_rest
     # Fit the network from simulated to measured tips.
     fit = fit_s2r(spec, settled, real, seed)
     others = (fit,) if printed else ()
@@ -203,27 +190,6 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     widths_kg = payload_intervals(held.held, unloaded, largest_kg)
     section = sections.with_pressures(section, held, widths_kg, KNOWN * largest_kg)
     return StepResult(arm, section, pairs)
-
-
-def s2r_errors(measurements: Measurements, arm: CalibratedArm, seed: int = 0) -> dict[str, PoseErrors]:
-    """Return errors of tips at the held-out poses of a calibration's network.
-
-    Args:
-        measurements: measurements of the calibration, of all of its logs: others hold out other poses.
-        arm: calibrated arm, with its network.
-        seed: seed of the calibration.
-
-    Returns:
-        Errors of the simulated arm, of the paper's network fitted to the other poses, and of the arm's S2R.
-    """
-    _, _, settled, real, _ = _settled_poses(measurements, arm.spec)
-    held_out = held_out_blocks(len(real), block=block_rows(len(real)), seed=seed)
-    judged = settled.take(held_out)
-    printed = fit_printed(settled.take(~held_out), real[~held_out], seed)
-    poses = {"simulated": judged.pose, "as printed": moved(judged.pose, printed(judged))}
-    if arm.s2r is not None:
-        poses["calibrated"] = correct(arm.s2r, judged.pose, judged.spring_m)
-    return {name: pose_errors(np.asarray(pose, float), real[held_out]) for name, pose in poses.items()}
 
 
 class _SettledPoses(NamedTuple):

@@ -68,19 +68,19 @@ def _picture(
 
     # Settle the arm, then draw it as it stands.
     pressure_kpa = np.broadcast_to(np.asarray(pressures), (1, arm.n_chambers))
-    found = settle_many(arm, pressure_kpa)
-    if not found.settled[0]:
+    settled = settle_many(arm, pressure_kpa)
+    if not settled.settled[0]:
         where, check = "--pressures", ""
         if not any(pressures):
             where, check = str(spec or arm.name), "; check the units of its masses, lengths and stiffnesses"
         raise InputError(
-            f"{where}: got an arm that does not settle, with {found.residual[0]:g} N or N m left: "
-            f"{SettleResult(found.result[0]).text}; expected an equilibrium{check}"
+            f"{where}: got an arm that does not settle, with {settled.residual[0]:g} N or N m left: "
+            f"{SettleResult(settled.result[0]).text}; expected an equilibrium{check}"
         )
     with Renderer(build_model(arm)) as renderer:
-        image = renderer.draw(np.asarray(found.q[0]))
+        image = renderer.draw(np.asarray(settled.q[0]))
     Image.fromarray(image).save(out, "PNG")
-    x, y, z = 1e3 * found.tip_position_m[0]
+    x, y, z = 1e3 * settled.tip_position_m[0]
     print(f"wrote {out}; tip at x {x:.1f}, y {y:.1f}, z {z:.1f} mm")
     return 0
 
@@ -104,12 +104,12 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     # Settle at all combinations, or at as many random pressures.
     out.mkdir(parents=True, exist_ok=True)
     every = 3**arm.n_chambers <= MAX_COMBINATIONS
-    found = extreme_poses(arm) if every else settle_many(arm, random_pressures(arm, N_RANDOM, 0))
-    n, n_lost = len(found.settled), int(np.sum(~found.settled))
+    settled = extreme_poses(arm) if every else settle_many(arm, random_pressures(arm, N_RANDOM, 0))
+    n, n_lost = len(settled.settled), int(np.sum(~settled.settled))
     if n_lost == n:
         raise InputError(f"{spec}: got an arm that settles at no combination of pressures, expected some")
     # Draw the tips, and print how far they reach.
-    tip_mm = 1e3 * np.asarray(found.tip_position_m, float)[found.settled]
+    tip_mm = 1e3 * np.asarray(settled.tip_position_m, float)[settled.settled]
     lateral, vertical = np.ptp(tip_mm[:, 1]), np.ptp(tip_mm[:, 2])
     plot.draw_workspace(out / "workspace.png", arm, tip_mm)
     kind = "combinations of" if every else "random"
@@ -119,7 +119,7 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     print("coverage of the YZ plane")
     print(f"  lateral (y)   {lateral:6.1f} mm{beside[0]}")
     print(f"  vertical (z)  {vertical:6.1f} mm{beside[1]}")
-    _tell_lengths(arm, np.asarray(found.spring_m, float)[found.settled])
+    _tell_lengths(arm, np.asarray(settled.spring_m, float)[settled.settled])
     print(f"wrote {out / 'workspace.png'}")
     return 0
 

@@ -21,9 +21,8 @@ import numpy as np
 from calib import demo
 from calib.fit.blocks import held_out_blocks
 from calib.fit.chambers import fit_chambers
-from calib.fit.lines import fit_line
-from calib.fit.network import fit_network
-from calib.fit.sensors import fit_springs
+from calib.fit.s2r import fit_network
+from calib.fit.springs import fit_line, fit_springs
 from calib.read.logs import read_log
 from calib.read.measurements import measure as measurements_of
 from mjx_softarm import ArmSpec
@@ -63,11 +62,11 @@ def planted_arm() -> dict[str, float]:
         springs, poses = (read_log(file)[0] for file in files[:2])
     assert springs.readings is not None and springs.spring_m is not None  # as the demo writes them
     lines = fit_springs(springs.readings, springs.spring_m, spec.spring_sensor)
-    sensor = {"beta": tuple(map(float, lines.beta)), "delta_m": tuple(map(float, lines.delta_m))}
+    sensor = {"beta": tuple(lines.slope.tolist()), "delta_m": tuple(lines.offset.tolist())}
     fit = fit_chambers(measurements_of([poses], spec), spec.replace(sensor=sensor))
     fitted, true = fit.spec.chambers, planted.chambers
     return {
-        "beta, largest error [%]": _worst(lines.beta, planted.sensor.beta),
+        "beta, largest error [%]": _worst(lines.slope, planted.sensor.beta),
         "stiffness, largest error [%]": _worst(fitted.stiffness_n_per_m, true.stiffness_n_per_m),
         "area, largest error [%]": _worst(fitted.area_m2, true.area_m2),
         "tip at held-out poses, before": fit.held_out_before.translation_mean_mm,

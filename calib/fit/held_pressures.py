@@ -64,10 +64,12 @@ def fit_held_pressures(
     rows = spring_m, simulated_kpa, left_kpa, stop
     held_out = held_out_blocks(len(left_kpa), block=HELD_OUT_BLOCK, seed=seed)
     judged = _process(spec, *(x[~held_out] for x in rows))
-    found = residual(judged, spring_m[held_out], simulated_kpa[held_out])
-    known_kpa = hysteresis_kpa(spec, judged, spring_m)[held_out] + found.mean_kpa.reshape(-1, spec.n_chambers)
+    predicted = residual(judged, spring_m[held_out], simulated_kpa[held_out])
+    known_kpa = hysteresis_kpa(spec, judged, spring_m)[held_out] + predicted.mean_kpa.reshape(
+        -1, spec.n_chambers
+    )
     after_kpa = left_kpa[held_out] - known_kpa
-    variance = found.share[..., None] * np.diagonal(judged.covariance_kpa2, axis1=1, axis2=2)
+    variance = predicted.share[..., None] * np.diagonal(judged.covariance_kpa2, axis1=1, axis2=2)
     # Fit to all poses.
     process = _process(spec, *rows)
     return PressureFit(

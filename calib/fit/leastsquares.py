@@ -12,7 +12,7 @@ Statistics" (1981), section 7; clusters: Bell and McCaffrey, Survey Methodology 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -64,21 +64,17 @@ class Solution(NamedTuple):
         return QUANTILE * np.sqrt(np.diag(self.covariance))
 
 
-def fit(
-    model: Model, problem: Problem, rounds: Sequence[str] = ROUNDS, end: Mapping[str, Any] = TOLERANCES
-) -> Solution:
+def fit(model: Model, problem: Problem) -> Solution:
     """Minimise Huber's loss of the errors over their scales, started from x = 0.
 
     Args:
         model: errors and their Jacobian.
         problem: scales and prior.
-        rounds: losses, as SciPy names them.
-        end: end of a round, as SciPy has it.
     """
     model = _remembering(model)
     x, scale = np.zeros(len(problem.prior)), problem.scale
-    for loss in rounds:
-        x = descend(model, x, scale, problem, loss, end)
+    for loss in ROUNDS:
+        x = descend(model, x, scale, problem, loss, TOLERANCES)
         scale = _scales(model(x)[0], problem)
     return refine(model, x, problem)
 
@@ -114,11 +110,11 @@ def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
         if solution.converged:
             break
         x = solution.x + solution.newton_step
-        found = model(x)
+        linearised = model(x)
         # Close to the minimum single precision hides changes of the loss, so the gradient decides.
-        if not _covariance(*found, x, solution.scale, problem)[2] < solution.decrement:
+        if not _covariance(*linearised, x, solution.scale, problem)[2] < solution.decrement:
             break
-        solution = solution_at(x, *found, problem)
+        solution = solution_at(x, *linearised, problem)
     return solution
 
 
@@ -197,10 +193,10 @@ def _covariance(
 
 def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:
     """Return the robust standard deviation of each group (n_groups,)."""
-    found = problem.scale.copy()
-    for k in range(len(found)):
+    scale = problem.scale.copy()
+    for k in range(len(scale)):
         of_group = error[np.broadcast_to(problem.group == k, error.shape)]
         of_group = of_group[np.isfinite(of_group)]
         if len(of_group):
-            found[k] = max(SIGMA_PER_MEDIAN * np.median(np.abs(of_group)), problem.min_scale[k])
-    return found
+            scale[k] = max(SIGMA_PER_MEDIAN * np.median(np.abs(of_group)), problem.min_scale[k])
+    return scale

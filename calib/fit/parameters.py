@@ -130,7 +130,7 @@ def _harmonics(order: int | None, n: int) -> np.ndarray:
 
 def by_name(x: Array | np.ndarray, structure: Structure) -> dict[str, Any]:
     """Return the blocks of x (p, ...) by name, those of chambers with a number for each chamber."""
-    found, start, n = {}, 0, structure.n_sections
+    values, start, n = {}, 0, structure.n_sections
     for block in BLOCKS:
         stop = start + _size(block, structure)
         value = x[start:stop]
@@ -139,8 +139,8 @@ def by_name(x: Array | np.ndarray, structure: Structure) -> dict[str, Any]:
             each = value.reshape(n, 1, patterns.shape[1], *value.shape[1:])
             weight = patterns.reshape(*patterns.shape, *(1 for _ in value.shape[1:])).astype(value.dtype)
             value = (weight * each).sum(axis=2).reshape(-1, *value.shape[1:])
-        found[block.name], start = value, stop
-    return found
+        values[block.name], start = value, stop
+    return values
 
 
 def with_numbers(x: Array, params: ArmParams) -> ArmParams:

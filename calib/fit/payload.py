@@ -72,8 +72,8 @@ class PayloadPoses(NamedTuple):
 
 def payload_poses(arm: CalibratedArm, n: int = N_POSES, seed: int = SEED) -> PayloadPoses:
     """Return poses at n random pressures, without those at which the arm does not settle."""
-    found = settle_many(arm.spec, random_pressures(arm.spec, n, seed))
-    at, both = held_at(arm, np.asarray(found.spring_m)[found.settled])
+    settled = settle_many(arm.spec, random_pressures(arm.spec, n, seed))
+    at, both = held_at(arm, np.asarray(settled.spring_m)[settled.settled])
     return PayloadPoses(*(values[both] for values in at))
 
 
@@ -157,10 +157,9 @@ def estimated_payload(
         pressure_kpa (m, n_chambers) [kPa]: measured pressures.
     """
     (at, _), held = held_at(arm, spring_m), arm.held
-    if held is None:
-        raise ValueError("arm.held: got None, expected residual pressures")
-    effect, found = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
-    left_kpa = pressure_kpa - at.pressure_kpa - found.mean_kpa.reshape(effect.shape)
+    assert held is not None  # `payloads` of `calib.steps` sees to it
+    effect, predicted = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
+    left_kpa = pressure_kpa - at.pressure_kpa - predicted.mean_kpa.reshape(effect.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
     for _ in range(N_PASSES):
         weight = np.linalg.solve(_covariance(held, at, payload_kg), effect[..., None])[..., 0]
@@ -192,8 +191,7 @@ def fit_payload_scale(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) 
         rows (k,): indices of `MIN_WEIGHED` poses or more with weights of `LEAST_WEIGHT` or more.
     """
     spec, held = arm.spec, arm.held
-    if held is None:
-        raise ValueError("arm.held: got None, expected residual pressures")
+    assert held is not None  # `payloads` of `calib.steps` sees to it
     # Estimate the weights from the pressures that remain
     weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
     kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
@@ -212,5 +210,5 @@ def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -
     """Return covariances (m, n, n) [kPa^2] of the pressures that hold arms with payloads (m,) [kg]."""
     effect = payload_kg[:, None] * at.effect_kpa_per_kg
     share = residual(held, at.spring_m, at.pressure_kpa).share
-    own = factor_covariance(held, effect.shape[1])
-    return covariances(held, share) + effect[:, :, None] * own * effect[:, None]
+    of_factor = factor_covariance(held, effect.shape[1])
+    return covariances(held, share) + effect[:, :, None] * of_factor * effect[:, None]

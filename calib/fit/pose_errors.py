@@ -18,28 +18,21 @@ class PoseErrors:
     translation_95_mm: float
     rotation_mean_deg: float
     rotation_95_deg: float
-    spring_rms_mm: float | None = None  # None where no spring was compared
 
 
-def errors_of(
-    distance_mm: np.ndarray, angle_deg: np.ndarray, spring_m: np.ndarray | None = None
-) -> PoseErrors:
+def errors_of(distance_mm: np.ndarray, angle_deg: np.ndarray) -> PoseErrors:
     """Sum up errors of n poses.
 
     Args:
         distance_mm (n,): distances of the tips.
         angle_deg (n,): angles between the tips' axes.
-        spring_m (n, n_springs): errors of spring lengths, NaN where not measured.
     """
     numbers = [
         f(x) if len(x) else np.nan
         for x in (distance_mm, angle_deg)
         for f in (np.mean, lambda x: np.percentile(x, 95.0))
     ]
-    spring_rms_mm = None
-    if spring_m is not None and np.isfinite(spring_m).any():
-        spring_rms_mm = 1e3 * float(np.sqrt(np.nanmean(spring_m**2)))
-    return PoseErrors(len(distance_mm), *map(float, numbers), spring_rms_mm=spring_rms_mm)
+    return PoseErrors(len(distance_mm), *map(float, numbers))
 
 
 def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:

@@ -82,8 +82,8 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
     lever_kgm = jnp.sum((below * body_kg)[..., None] * (body_m - position[:, None]), axis=1)
     moment = jnp.cross(lever_kgm, jnp.array([0.0, 0.0, 1.0])) / (0.5 * length_m[:, None] * body_kg.sum())
     local = jnp.einsum("sij,si->sj", rotation, moment)
-    own = spring_m.reshape(n_sections, -1) / (0.25 * length_m[:, None])
-    own = own * math.sqrt(3 / own.shape[1])
+    stretched = spring_m.reshape(n_sections, -1) / (0.25 * length_m[:, None])
+    stretched = stretched * math.sqrt(3 / stretched.shape[1])
     # Let the middle move: the tip moves with it as one rigid body.
     lever_mm = 500.0 * jnp.max(length_m)
     aside = 1000.0 * (frames.tip_position - position)[:, None, :]
@@ -91,7 +91,7 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
     shift = jnp.concatenate([rotation, jnp.swapaxes(turned, 1, 2)], axis=2)
     turn = jnp.concatenate([jnp.zeros_like(rotation), rotation], axis=2)
     effect = jnp.concatenate([shift, turn], axis=1)
-    return Sections(jnp.concatenate([own, rotation[:, 2, :], local], axis=1), effect, lever_mm)
+    return Sections(jnp.concatenate([stretched, rotation[:, 2, :], local], axis=1), effect, lever_mm)
 
 
 def fit_process(rows: Sections, y: np.ndarray) -> SectionProcess:
@@ -112,11 +112,11 @@ def fit_process(rows: Sections, y: np.ndarray) -> SectionProcess:
 
 def predict(process: SectionProcess, at: Sections) -> np.ndarray:
     """Return the mean (m, 6) [mm, Gibbs vector] for m simulated arms."""
-    found = np.zeros((len(at.state), N_OUTPUTS))
+    mean = np.zeros((len(at.state), N_OUTPUTS))
     for s in range(at.state.shape[1]):
         likeness = _likeness(at.state[:, s], process.rows.state[:, s], process.length)
-        found += np.einsum("nij,nj->ni", at.effect[:, s], likeness @ process.weight[:, s])
-    return found / _units(at)
+        mean += np.einsum("nij,nj->ni", at.effect[:, s], likeness @ process.weight[:, s])
+    return mean / _units(at)
 
 
 def _some(rows: Sections, y: np.ndarray, n: int) -> tuple[Sections, np.ndarray]:

@@ -1,23 +1,28 @@
 """Reading of logs: checks, and reduction to the rows that can be believed.
 
 `mjx_softarm.logs.schema` defines the columns. A file that cannot be understood (a missing column, a wrong
-unit) is refused. Otherwise each row is kept or dropped whole. A row is dropped for a NaN, a reading out of
-range, a time that does not increase, motion capture that was not renewed or is turned, or an outlier; only
-references, goals and estimates of the control loop may be NaN. Signs of quaternions are repaired. Columns
+unit) is refused. Otherwise each row is kept or dropped whole. Rows are checked in three stages, each on the
+rows that the stage before kept: single rows (NaN, time, range); rows beside the row before (motion capture
+that was not renewed or is turned); outliers. Only references, goals and estimates of the control loop may be
+NaN. Signs of quaternions are repaired. Columns
 that never change, time gaps and unknown columns are only reported. Each finding has the number of rows it
 dropped.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
-from calib.read.table_checks import PLAUSIBLE, clean, implausible, quantity
-from mjx_softarm.logs.checks import Finding
-from mjx_softarm.logs.files import read_matrix, refuse
+from mjx_softarm.logs import checks
+from mjx_softarm.logs.checks import Finding, LogError
+from mjx_softarm.logs.files import LogMatrix, read_matrix, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log, log_columns, write_log
+from mjx_softarm.posture import hangs, posture
 from mjx_softarm.sensing.sensors import SENSORS
 from mjx_softarm.spec import ArmSpec
 
@@ -55,8 +60,8 @@ def read_log(
     matrix, findings = read_matrix(path, spec, one_of=NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
         refuse(implausible(matrix, spec))
-        matrix, found = clean(matrix)
-    findings += found
+        matrix, cleaning = clean(matrix)
+    findings += cleaning
     if strict:
         refuse(findings)
     return matrix.log(), findings
@@ -114,3 +119,218 @@ def schema_text(n_chambers: int, n_springs: int, n_markers: int) -> str:
         plausible = f"{bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
         lines.append(f"{names:<30} {', '.join(units):<26} {plausible}")
     return "\n".join(lines)
+
+
+class Plausible(NamedTuple):
+    """Plausible values of a quantity of a soft arm a few decimetres long, in the first unit of `UNITS`."""
+
+    low: float  # least plausible value
+    high: float  # greatest plausible value
+    least: float = 0.0  # size that the largest values reach, unless all values are zero
+    spike: float = np.inf  # distance from its neighbours up to which a value is no outlier
+
+
+# A column whose median is outside has the wrong unit, or is another column; a row with a value outside is
+# dropped. The bounds distinguish mm from cm and m for such an arm, and Pa from kPa and bar. They cannot
+# distinguish psi from kPa, rad from deg, or one chamber from another.
+PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
+    {
+        "time": Plausible(5e-4, 19.0),  # median step: 2 kHz down to a pose every 19 s
+        "length": Plausible(0.03, 1.0, spike=1e-3),  # length of a spring
+        "position": Plausible(-3.0, 3.0, least=0.1, spike=2e-3),  # tip and markers, from the base
+        "pressure": Plausible(-105.0, 1000.0, least=0.5, spike=10.0),  # vacuum to ten bar
+        "mass": Plausible(0.0, 5.0, least=1e-3),
+        "number": Plausible(-1.1, 1.1),  # part of a unit quaternion
+        "id": Plausible(0.0, 1e6),
+        "pose_length": Plausible(-3000.0, 3000.0, least=100.0),
+        "angle": Plausible(-360.0, 360.0),
+        **{kind.reading_name: Plausible(*kind.plausible, spike=kind.spike) for kind in SENSORS.values()},
+    }
+)
+BY_HAND_ROWS = 300  # fewer rows may be poses that were recorded by hand
+BY_HAND_S = 600.0  # longest median step of poses that were recorded by hand
+ALONG_M = 0.05  # least median distance of the tip from the base, along the straight arm
+FROM_LOOP = ("reference_m", "goal", "estimate", "load_kg")  # columns of the control loop; may hold NaN
+MEASURED = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
+
+
+class RowFault(NamedTuple):
+    """Rows with one fault."""
+
+    column: str
+    problem: str
+    mask: np.ndarray  # (n,)
+    drops: bool = True
+    counted: bool = True  # the finding begins with the number of rows
+
+
+def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
+    """Return the rows that can be believed, with quaternion signs repaired, and all findings."""
+    findings = [_finding(matrix, fault) for fault in _gaps(matrix)]
+    # Drop rows stage by stage.
+    for stage in (_single_rows, _renewal, _neighbours):
+        faults = [fault for fault in stage(matrix) if fault.mask.any()]
+        findings += [_finding(matrix, fault) for fault in faults]
+        dropped = [fault.mask for fault in faults if fault.drops]
+        if dropped:
+            keep = ~np.logical_or.reduce(dropped)
+            matrix = matrix._replace(values=matrix.values[keep], row=matrix.row[keep])
+        if len(matrix.row) < 2:
+            left = f"got {len(matrix.row)} rows left, expected 2 at least"
+            raise LogError([*findings, Finding(matrix.file, None, "", left)])
+    # Give neighbouring quaternions one sign.
+    if quaternion := matrix.indices("tip_quaternion"):
+        matrix.values[:, quaternion], flipped = checks.same_sign(matrix.values[:, quaternion])
+        if flipped.any():
+            problem = "sign flipped, repaired; expected neighbours of one sign"
+            findings.append(_finding(matrix, RowFault("tip_qw..qz", problem, flipped, drops=False)))
+    return matrix, findings
+
+
+def _gaps(matrix: LogMatrix) -> Iterator[RowFault]:
+    """Find rows missing in the file, by its times."""
+    time_s = matrix.values[:, 0]
+    finite = np.flatnonzero(np.isfinite(time_s))
+    ordered = finite[~checks.late_rows(time_s[finite])]
+    gap = np.zeros(len(time_s), bool)
+    gap[ordered] = checks.gap_rows(time_s[ordered])
+    if gap.any():
+        steps_s = np.diff(time_s[ordered])
+        expected = f"expected steps near {np.median(steps_s):.4g} s"
+        yield RowFault("time", f"gap, longest {steps_s.max():.4g} s, {expected}", gap, drops=False)
+
+
+def _finding(matrix: LogMatrix, fault: RowFault) -> Finding:
+    rows = matrix.row[fault.mask]
+    problem = f"{len(rows)} x {fault.problem}" if fault.counted else fault.problem
+    n_dropped = len(rows) if fault.drops else 0
+    return Finding(matrix.file, (int(rows[0]), int(rows[-1])), fault.column, problem, n_dropped)
+
+
+def implausible(matrix: LogMatrix, spec: ArmSpec) -> list[Finding]:
+    """Find reasons to refuse the log: columns without numbers, or that contradict their header or the arm."""
+    if len(matrix.row) < 2:
+        return [Finding(matrix.file, None, "", f"got {len(matrix.row)} row, expected 2 at least")]
+    problems = {}
+    for k, column in enumerate(matrix.columns):
+        problems[column.name] = _implausible_column(column, matrix.values[:, k])
+    for group in dict.fromkeys(column.group for column in matrix.columns[1:]):
+        problems[group] = _implausible_size(matrix, group)
+    if tip := matrix.indices("tip_m"):
+        along_m = _typical(matrix.values[:, tip] @ -posture(spec)[:, 2])
+        if along_m < ALONG_M:
+            turn_deg = spec.mounting.base_turn_deg
+            points = "hangs from the base" if hangs(spec) else f"is turned by {turn_deg} deg"
+            got = f"got a median of {along_m:.3g} m along the straight arm"
+            expected = f"{ALONG_M} m or more, as z is up and the arm {points}"
+            problems["tip_z"] = problems["tip_z"] or f"{got}, expected {expected}"
+    return [Finding(matrix.file, None, name, problem) for name, problem in problems.items() if problem]
+
+
+def _typical(values: np.ndarray) -> float:
+    """Return the median of the finite values; NaN if there is none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else np.nan
+
+
+def _implausible_column(column: Column, values: np.ndarray) -> str:
+    what = "median step" if column.kind == "time" else "median"
+    if not np.isfinite(values).any():
+        return "" if column.group in FROM_LOOP else "got no number in the whole column, expected some"
+    got = _typical(np.diff(values) if column.kind == "time" else values)
+    low, high, *_ = PLAUSIBLE[quantity(column)]
+    by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
+    if low <= got <= high or by_hand:
+        return ""
+    factors = UNITS[column.kind]
+    factor = factors[column.unit]
+    fitting = [unit for unit, other in factors.items() if low <= got / factor * other <= high]
+    hint = f" (plausible in {' or '.join(fitting)})" if fitting else ""
+    expected = f"{low / factor:.4g} to {high / factor:.4g} {column.unit}"
+    return (
+        f"got a {what} of {got / factor:.4g} {column.unit}{hint}, expected {expected}: wrong unit or column"
+    )
+
+
+def quantity(column: Column) -> str:
+    """Return the key of a column in `PLAUSIBLE`."""
+    return "position" if column.group in ("tip_m", "marker_m") else column.kind
+
+
+def _implausible_size(matrix: LogMatrix, group: str) -> str:
+    chosen = [k for k in matrix.indices(group) if PLAUSIBLE[quantity(matrix.columns[k])].least > 0.0]
+    if not chosen:
+        return ""
+    column = matrix.columns[chosen[0]]
+    sizes = np.abs(matrix.values[:, chosen])
+    sizes = sizes[np.isfinite(sizes)]
+    largest = np.percentile(sizes, 99) if len(sizes) else 0.0
+    least, factor = PLAUSIBLE[quantity(column)].least, UNITS[column.kind][column.unit]
+    if largest == 0.0 or largest >= least:
+        return ""
+    got, expected = f"{largest / factor:.4g} {column.unit}", f"{least / factor:.4g} {column.unit} at least"
+    return f"got 99 % of the values below {got}, expected the largest to reach {expected}: wrong unit"
+
+
+def _shown(column: Column, value: float) -> str:
+    """Format a value in the unit of the file."""
+    return f"{value / UNITS[column.kind][column.unit]:.6g} {column.unit}".removesuffix(" 1")
+
+
+def _single_rows(matrix: LogMatrix) -> Iterator[RowFault]:
+    for k, column in enumerate(matrix.columns):
+        values = matrix.values[:, k]
+        finite = np.isfinite(values)
+        missing = np.isinf(values) if column.group in FROM_LOOP else ~finite
+        yield RowFault(column.name, "NaN or inf, expected numbers", missing)
+        if column.kind == "time":
+            late = np.zeros(len(values), bool)
+            late[finite] = checks.late_rows(values[finite])
+            yield RowFault("time", "repeated or going back, expected times that increase", late)
+            continue
+        low, high, *_ = PLAUSIBLE[quantity(column)]
+        outside = finite & ((values < low) | (values > high))
+        if outside.any():
+            expected = f"expected {_shown(column, low)} to {_shown(column, high)}"
+            first = _shown(column, values[outside][0])
+            yield RowFault(column.name, f"out of range, first {first}, {expected}", outside)
+
+
+def _renewal(matrix: LogMatrix) -> Iterator[RowFault]:
+    everywhere = np.ones(len(matrix.row), bool)
+    for k in matrix.indices("readings", "spring_m", "pressure_kpa"):
+        if np.ptp(matrix.values[:, k]) == 0.0:
+            always = _shown(matrix.columns[k], matrix.values[0, k])
+            problem = f"got always {always}, expected a sensor that changes"
+            yield RowFault(matrix.columns[k].name, problem, everywhere, drops=False, counted=False)
+    for name, axes in matrix.bodies():
+        body = matrix.values[:, axes]
+        if checks.moves(body):
+            # A quaternion that changes shows that the tip was seen, though its position stays.
+            seen = matrix.indices("tip_quaternion") if name == "tip" else []
+            stale = checks.stale_rows(matrix.values[:, [*axes, *seen]])
+            problem = "equal to the row before, expected motion capture renewed in each row"
+            yield RowFault(f"{name}_x..z", problem, stale)
+        elif name == "tip":
+            problem = "got a tip that never moves by 1 mm, expected one that moves"
+            yield RowFault("tip_x..z", problem, everywhere, drops=False, counted=False)
+    if quaternion := matrix.indices("tip_quaternion"):
+        values = matrix.values[:, quaternion]
+        wrong = checks.not_unit_rows(values)
+        first = f"{np.linalg.norm(values[wrong][:1]):.4g}"
+        yield RowFault("tip_qw..qz", f"length not 1, first {first}, expected unit quaternions", wrong)
+        turned = np.zeros(len(wrong), bool)
+        turned[~wrong] = checks.turned_rows(values[~wrong])
+        problem = "turned by 180 degrees between jumps, expected a continuous orientation"
+        yield RowFault("tip_qw..qz", problem, turned)
+
+
+def _neighbours(matrix: LogMatrix) -> Iterator[RowFault]:
+    for k in matrix.indices(*MEASURED):
+        column = matrix.columns[k]
+        outlier = checks.outlier_rows(matrix.values[:, k], PLAUSIBLE[quantity(column)].spike)
+        if outlier.any():
+            first = _shown(column, matrix.values[outlier, k][0])
+            yield RowFault(
+                column.name, f"outlier, first {first}, expected a value like its neighbours", outlier
+            )

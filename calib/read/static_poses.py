@@ -75,10 +75,10 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     row_uses = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
     row_uses |= {"goal not held long enough": 0}
-    found = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, row_uses)]
-    n, n_springs = len(found), spec.n_springs
+    rests = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, row_uses)]
+    n, n_springs = len(rests), spec.n_springs
     # Stack the poses; pad the rows of readings.
-    *columns, rows = list(zip(*found, strict=True)) if found else [[]] * 7
+    *columns, rows = list(zip(*rests, strict=True)) if rests else [[]] * 7
     shapes = ((spec.n_chambers,), (), (3,), (3, 3), (n_springs,), (n_markers, 3))
     arrays = [np.reshape(list(c), (n, *shape)) for c, shape in zip(columns, shapes, strict=True)]
     n_rows = np.array([len(readings) for readings in rows], int)
@@ -114,7 +114,7 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
     if log.tip_m is not None and log.tip_quaternion is not None:
         tips, rotation = log.tip_m, rotation_from_quaternion(log.tip_quaternion)
     # Average the rows at each rest.
-    found = []
+    poses = []
     rests = _rests if log.goal is None else _rests_of_loop
     for rows in rests(log, payload, spec, row_uses):
         row_uses["used"] += len(rows)
@@ -123,8 +123,8 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
         )
         kept = payload[rows[0]]  # the payload of all rows, which a mean would round
         turn = nearest_rotation(turn) if np.isfinite(turn).all() else turn
-        found.append((pressure, kept, tip, turn, spring, marker, readings[rows]))
-    return found
+        poses.append((pressure, kept, tip, turn, spring, marker, readings[rows]))
+    return poses
 
 
 def _rests(log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, int]) -> Iterator[np.ndarray]:
@@ -177,10 +177,10 @@ def _lag_s(spec: ArmSpec) -> np.ndarray:
     gains, n = Gains.from_spec(spec), spec.n_chambers
 
     def springs(pressure_kpa: np.ndarray) -> np.ndarray:
-        found = settle_many(spec, pressure_kpa.reshape(-1, n))
+        settled = settle_many(spec, pressure_kpa.reshape(-1, n))
         # A chamber counts as moving nothing where one of its two arms does not settle.
-        known = np.asarray(np.asarray(found.settled).reshape(2, n).all(axis=0))
-        return np.where(known[:, None], np.asarray(found.spring_m, float).reshape(2, n, -1), 0.0)
+        known = np.asarray(np.asarray(settled.settled).reshape(2, n).all(axis=0))
+        return np.where(known[:, None], np.asarray(settled.spring_m, float).reshape(2, n, -1), 0.0)
 
     return law_lag_s(gains, springs, middle_kpa(gains, n))
 

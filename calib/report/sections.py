@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from calib.changes import Changes
 from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import PressureFit
-from calib.fit.markers import MarkerLimits
 from calib.fit.motion.actuators import MARGIN, MARGIN_BY_SPRINGS, SMALL_KPA, ActuatorFit
 from calib.fit.motion.damping import DampingFit
 from calib.fit.motion.shape import ShapeFit
@@ -21,7 +20,7 @@ from calib.fit.parameters import BENDING, BOND, without_effect
 from calib.fit.payload import MOST_OFF, PayloadScaleFit
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
-from calib.fit.sensors import SpringFit
+from calib.fit.springs import LineFit
 from calib.report.page import ReportTable, Section, as_json, plain
 from mjx_softarm._support.fields import PerSection
 from mjx_softarm.pneumatics import Regulator
@@ -33,7 +32,7 @@ CHANGES, PAYLOADS = "Changes", "Payloads"
 ENOUGH = 2.0  # held-out error over that of the calibration, from which there is a warning; by hand
 
 
-def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
+def springs(fit: LineFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
     """Show beta and delta of each spring.
 
     Args:
@@ -43,16 +42,15 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_
         per_section: springs of a section, which are a row of the figure.
     """
     # Tabulate the fit.
-    half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
-    half_delta = 0.5 * np.ptp(fit.delta_interval_m, axis=1)
+    beta, delta_mm, held_out_mm = fit.slope, 1e3 * fit.offset, 1e3 * fit.held_out_rms
     rows = tuple(
-        (f"spring {k}", fit.beta[k], half_beta[k], 1e3 * fit.delta_m[k], 1e3 * half_delta[k])
-        + (1e3 * fit.held_out_rms_m[k], int(fit.n_rows[k]), int(fit.n_outliers[k]))
-        for k in range(len(fit.beta))
+        (f"spring {k}", beta[k], fit.slope_width[k], delta_mm[k], 1e3 * fit.offset_width[k])
+        + (held_out_mm[k], int(fit.n_rows[k]), int(fit.n_outliers[k]))
+        for k in range(len(beta))
     )
     head = ("", "beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
     # Draw the residuals of each spring.
-    n_rows = len(fit.beta) // per_section
+    n_rows = len(beta) // per_section
     figure = Figure(figsize=(7.5, 1.0 + 1.6 * n_rows), layout="constrained")
     each = figure.subplots(n_rows, per_section, sharex=True, sharey=True, squeeze=False)
     for k, axes in enumerate(each.flat):
@@ -118,7 +116,7 @@ def chambers(fit: ChamberFit) -> Section:
         + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
         (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
-        plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
+        plain(fit, "spec", "poses", "is_held_out", "tip_error_mm")
         | {"values": values | dict(parts) | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
         fit.notes,
@@ -144,25 +142,6 @@ def _mounting(fit: ChamberFit) -> ReportTable:
             for label, value, width in zip(labels, values, fit.half_width_95[name], strict=True)
         ]
     return ReportTable(("", "value", "+-"), tuple(rows))
-
-
-def with_markers(section: Section, limits: MarkerLimits) -> Section:
-    """Add the chambers' lengths at the most bent poses, measured by markers, to their section."""
-    figure, axes = _figure()
-    axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
-    axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
-    axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
-    lengths = ("chambers at the most bent poses", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
-    simulated = (float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max))
-    rows = (lengths, ("simulated at the same poses", *simulated))
-    table = ReportTable(("", "shortest [mm]", "longest [mm]"), rows)
-    title = f"chambers at the {len(limits.pose)} most bent poses"
-    return dataclasses.replace(
-        section,
-        tables=(*section.tables, table),
-        data=section.data | {"markers": plain(limits)},
-        figures=(*section.figures, (title, figure)),
-    )
 
 
 def s2r(
@@ -257,9 +236,9 @@ def with_pressures(
 def actuators(fit: ActuatorFit) -> Section:
     """Show the numbers of the actuators and the errors of the pressures."""
     # A row for each chamber: its numbers, with intervals where they were fitted, and its error
-    found, n = fit.spec.actuators, fit.spec.n_chambers
-    each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(found).items()}
-    widths = fit.half_width_95 if isinstance(found, Regulator) else {}
+    kept, n = fit.spec.actuators, fit.spec.n_chambers
+    each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(kept).items()}
+    widths = fit.half_width_95 if isinstance(kept, Regulator) else {}
     rows = []
     for k in range(n):
         pairs = ((value[k], widths[name][k]) if widths else (value[k],) for name, value in each.items())
@@ -281,14 +260,14 @@ def actuators(fit: ActuatorFit) -> Section:
     return Section(
         "Actuators",
         f"{fit.n_tracks} tracks of commands and pressures, {fit.time_s:.0f} s in all: "
-        f"{found.kind}s driven with the commands against the {against}. Intervals are 95 %. "
+        f"{kept.kind}s driven with the commands against the {against}. Intervals are 95 %. "
         f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s). {_kept(fit)}",
         (
             ReportTable(("", *titles, "held-out RMS [kPa]"), tuple(rows)),
             ReportTable(("pressures", "RMS [kPa]"), errors),
         ),
         fit.warnings,
-        plain(fit, "spec", "notes") | {"kind": found.kind, "values": as_json(dataclasses.asdict(found))},
+        plain(fit, "spec", "notes") | {"kind": kept.kind, "values": as_json(dataclasses.asdict(kept))},
         notes=fit.notes,
     )
 
@@ -343,23 +322,23 @@ def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
     )
 
 
-def changes(found: Changes, known_mm: float) -> Section:
+def changes(fit: Changes, known_mm: float) -> Section:
     """Show what has changed, and whether that explains the later poses.
 
     Args:
-        found: fitted changes.
+        fit: fitted changes.
         known_mm: mean error of the tip at held-out poses of the calibration, 0 if not known.
     """
     # Tables of the springs, the chambers and the errors
-    springs = _rows("spring", 1e3 * found.zero_m, 1e3 * found.zero_half_width_m)
-    chambers = _rows("chamber", 100 * found.stiffness, found.offset_kpa)
+    springs = _rows("spring", 1e3 * fit.zero_m, 1e3 * fit.zero_half_width_m)
+    chambers = _rows("chamber", 100 * fit.stiffness, fit.offset_kpa)
     errors = tuple(
         (what, tip.translation_mean_mm, tip.rotation_mean_deg, kpa)
         if tip.n
         else (what, "not measured", "not measured", kpa)
         for what, tip, kpa in (
-            ("before", found.before, found.before_kpa),
-            ("with the changes", found.after, found.after_kpa),
+            ("before", fit.before, fit.before_kpa),
+            ("with the changes", fit.after, fit.after_kpa),
         )
     )
     tables = (
@@ -370,7 +349,7 @@ def changes(found: Changes, known_mm: float) -> Section:
 
     # A sentence for the terminal, and a warning where more has changed
     warnings: tuple[str, ...] = ()
-    after_mm = found.after.translation_mean_mm if found.is_better else found.before.translation_mean_mm
+    after_mm = fit.after.translation_mean_mm if fit.is_better else fit.before.translation_mean_mm
     if known_mm and after_mm > ENOUGH * known_mm:
         warnings = (
             f"{after_mm:.1f} mm remain at held-out poses, {known_mm:.1f} mm at the calibration: more has "
@@ -378,50 +357,50 @@ def changes(found: Changes, known_mm: float) -> Section:
         )
     return Section(
         CHANGES,
-        f"{found.n} later poses of the unloaded arm against the calibrated simulation. Zeros are true "
+        f"{fit.n} later poses of the unloaded arm against the calibrated simulation. Zeros are true "
         "lengths minus lengths read. A stiffness and an offset of the pressures differ to some per cent. "
         "Intervals are 95 %; contiguous blocks of poses are held out.",
         tables,
         warnings,
-        plain(found, "spec") | {"is_better": found.is_better},
-        notes=(_sentence(found),),
+        plain(fit, "spec") | {"is_better": fit.is_better},
+        notes=(_sentence(fit),),
     )
 
 
-def payloads(found: PayloadScaleFit) -> Section:
+def payloads(fit: PayloadScaleFit) -> Section:
     """Show how strongly the arm feels payloads, by poses with a known weight."""
-    estimate = f"{found.n} poses with a known weight gave {found.ratio:.3f} of it in the mean"
-    if not found.is_plausible:
+    estimate = f"{fit.n} poses with a known weight gave {fit.ratio:.3f} of it in the mean"
+    if not fit.is_plausible:
         expected = f"expected {1.0 - MOST_OFF:.1f} to {1.0 + MOST_OFF:.1f}"
         remedy = "check the weight and its unit, and whether the arm has changed since the calibration"
         warning = f"{estimate}, {expected}: {remedy}"
-        return Section(PAYLOADS, f"{estimate}.", warnings=(warning,), data=found._asdict())
-    percent = 100.0 * QUANTILE * found.factor_sd
+        return Section(PAYLOADS, f"{estimate}.", warnings=(warning,), data=fit._asdict())
+    percent = 100.0 * QUANTILE * fit.factor_sd
     text = (
-        f"{estimate}. So a payload changes the pressures by {found.factor:.3f} of the simulated change. Near "
+        f"{estimate}. So a payload changes the pressures by {fit.factor:.3f} of the simulated change. Near "
         f"these poses this factor is known to {percent:.0f} % (95 %); other errors add to it."
     )
-    off = 100.0 * (found.ratio - 1.0)
+    off = 100.0 * (fit.ratio - 1.0)
     note = (
         f"payloads were estimated {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
     )
-    return Section(PAYLOADS, text, data=found._asdict(), notes=(note,))
+    return Section(PAYLOADS, text, data=fit._asdict(), notes=(note,))
 
 
 def _rows(name: str, *columns: np.ndarray) -> tuple[tuple[Any, ...], ...]:
     return tuple((f"{name} {k}", *map(float, row)) for k, row in enumerate(zip(*columns, strict=True)))
 
 
-def _sentence(found: Changes) -> str:
-    if not found.is_better:
+def _sentence(fit: Changes) -> str:
+    if not fit.is_better:
         return "nothing has changed that these poses show: the calibration stays as it is"
-    zero_mm = ", ".join(f"{x:+.1f}" for x in 1e3 * found.zero_m)
-    mean, half = 100 * found.stiffness.mean(), 100 * found.mean_half_width
+    zero_mm = ", ".join(f"{x:+.1f}" for x in 1e3 * fit.zero_m)
+    mean, half = 100 * fit.stiffness.mean(), 100 * fit.mean_half_width
     what = f"zeros of the springs {zero_mm} mm; stiffness of the chambers {mean:+.0f} +- {half:.0f} %"
-    if not found.before.n:  # no motion capture
-        off = f"{found.before_kpa:.2f} kPa off before, {found.after_kpa:.2f} now"
+    if not fit.before.n:  # no motion capture
+        off = f"{fit.before_kpa:.2f} kPa off before, {fit.after_kpa:.2f} now"
         return f"{what}; pressures at held-out poses {off}"
-    before_mm, after_mm = found.before.translation_mean_mm, found.after.translation_mean_mm
+    before_mm, after_mm = fit.before.translation_mean_mm, fit.after.translation_mean_mm
     return f"{what}; tips at held-out poses {before_mm:.1f} mm off before, {after_mm:.1f} mm now"
 
 

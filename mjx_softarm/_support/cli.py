@@ -145,9 +145,9 @@ def _line(command: Command) -> str:
     """Return the first line of a command's docstring."""
     if isinstance(command, str):  # read from the file, because an import may take seconds
         module, _, name = command.partition(":")
-        found = importlib.util.find_spec(module)
-        assert found and found.origin, module
-        body = ast.parse(Path(found.origin).read_text("utf-8")).body
+        module_spec = importlib.util.find_spec(module)
+        assert module_spec and module_spec.origin, module
+        body = ast.parse(Path(module_spec.origin).read_text("utf-8")).body
         defined = [node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
         text = next(ast.get_docstring(node) for node in defined if node.name == name)
     else:

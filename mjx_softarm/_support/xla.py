@@ -126,19 +126,6 @@ def rows_last(function: Callable, n_at_once: int | None = None, n_shared: int = 
     return one
 
 
-def jit_at_first_call(**kwargs: Any) -> Callable[[Callable], Callable]:
-    """Return a decorator that compiles as `jit` does, for functions of a module.
-
-    Options are looked up at the first call, because a look-up at import would start JAX on a device.
-    """
-
-    def decorate(function: Callable) -> Callable:
-        compiled = functools.cache(lambda: jit(function, **kwargs))
-        return functools.wraps(function)(lambda *args, **keywords: compiled()(*args, **keywords))
-
-    return decorate
-
-
 def enable_compilation_cache() -> Path:
     """Keep compiled programs in `$XDG_CACHE_HOME/mjx_softarm/xla` or `~/.cache`, for a fast second start."""
     path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx_softarm" / "xla"

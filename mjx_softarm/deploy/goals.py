@@ -1,12 +1,12 @@
 """Goals of a run: from a list, by somebody's orders, or one that moves past poses.
 
-Each kind is a `Goals`. Only `n_goals` of them count for the run's exit status.
+Only `n_goals` of them count for the run's exit status; of these, `n_taken` are taken or refused so far.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -22,32 +22,10 @@ Events = tuple[Event, ...]
 Order = Literal["vent", "hold"] | Sequence[np.ndarray] | None
 
 
-class Goals(Protocol):
-    """Interface of a source of goals."""
-
-    n_goals: int  # number of goals that count
-    n_taken: int  # number of goals taken or refused so far
-
-    @property
-    def ways(self) -> Sequence[slice]:
-        """Rows of the log in which the goal moved."""
-        ...
-
-    def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
-        """Return the state with the goal of a tick, None where the run is over; and refusals of goals.
-
-        Args:
-            state: after the last tick.
-            now_s: time.
-            row: of the log.
-        """
-        ...
-
-
 class ListedGoals:
     """Goals one after the other, as `follow` takes them; goals in `refused`, by index, are skipped."""
 
-    ways: Sequence[slice] = ()
+    ways: Sequence[slice] = ()  # rows of the log in which the goal moved
 
     def __init__(
         self,
@@ -68,7 +46,16 @@ class ListedGoals:
         self.n_taken = 0
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
-        """Go on to the next accepted goal where there is none; end after the last one, or the duration."""
+        """Go on to the next accepted goal where there is none; end after the last one, or the duration.
+
+        Args:
+            state: after the last tick.
+            now_s: time.
+            row: of the log, in this tick.
+
+        Returns:
+            The state with the goal of this tick, None where the run is over; refusals of goals.
+        """
         self._began_s = now_s if np.isnan(self._began_s) else self._began_s
         state, events = self.take_next(state)
         over = self._duration_s is not None and now_s - self._began_s >= self._duration_s

@@ -16,7 +16,7 @@ import numpy as np
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import DONE, MISSED, Ending, vent_at_end
-from mjx_softarm.deploy.goals import Goals, ListedGoals, MovingGoal, Order, OrderedGoals
+from mjx_softarm.deploy.goals import ListedGoals, MovingGoal, Order, OrderedGoals
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import LoopState, in_force, refusals, start, step
 from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, stop_of
@@ -149,7 +149,7 @@ class _Session:
         self,
         arm: ArmIO,
         controller: Controller,
-        goals: Goals,
+        goals: ListedGoals | MovingGoal,
         tell: Callable[[str], None],
         arrived: Callable[[int], None] = lambda goal: None,
         look: Callable[[LoopState, dict[str, Any]], None] = lambda state, row: None,

@@ -101,35 +101,32 @@ class EnvConfig:
             InputError: a corrected arm is to have other links, or an action is shorter than a control period.
         """
         period_s = 1.0 / spec.control.rate_hz
-        own = spec.structure.links_per_section
-        same = self.links_per_section in (None, own)
+        links = spec.structure.links_per_section
+        same = self.links_per_section in (None, links)
         required = {
             "dynamic_step_s": (self.dynamic_step_s >= period_s, f"{period_s:g} or more, a control period"),
-            "links_per_section": (same or not corrected, f"{own}, as the sim-to-real network has"),
+            "links_per_section": (same or not corrected, f"{links}, as the sim-to-real network has"),
         }
         check_settings("EnvConfig", self, required)
         return spec if same else spec.replace(structure={"links_per_section": self.links_per_section})
 
     def __post_init__(self):
-        # Names, and which of them go together
+        # Names
         names = {"mode": tuple(ENGINES), "engine": get_args(Engine), "observation": get_args(Observation)}
         known = {
             name: (getattr(self, name) in allowed, f"one of {allowed}") for name, allowed in names.items()
         }
         check_settings("EnvConfig", self, known)
+
+        # Which of them go together, and ranges of numbers
         engines = ENGINES[self.mode]
         observed = self.moves or self.observation != "motion"
-        required = {
-            "engine": (self.engine in engines, f"one of {engines} with the mode {self.mode!r}"),
-            "observation": (observed, "'pose' or 'payload' for arms at rest"),
-        }
-        check_settings("EnvConfig", self, required)
-
-        # Ranges of numbers
         links = self.links_per_section
         other = f"another: {HELD_OUT_SEED} draws the goals of the evaluation"
         amount = "a finite number >= 0"
         required = {
+            "engine": (self.engine in engines, f"one of {engines} with the mode {self.mode!r}"),
+            "observation": (observed, "'pose' or 'payload' for arms at rest"),
             "dynamic_step_s": (0 < self.dynamic_step_s < math.inf, "a finite number > 0"),
             "simulation_step_s": (0 < self.simulation_step_s < math.inf, "a finite number > 0"),
             "saturation_tolerance_mm": (0 <= self.saturation_tolerance_mm < math.inf, amount),
@@ -143,9 +140,9 @@ class EnvConfig:
         check_settings("EnvConfig", self, required)
         costs = {item.name for item in fields(self.reward)} - {"axes"}
         axes = self.reward.axes
-        weighed = len(axes) == 6 and all(0 <= axis < math.inf for axis in axes) and any(self.reward.asked)
+        usable = len(axes) == 6 and all(0 <= axis < math.inf for axis in axes) and any(self.reward.asked)
         required = {name: (0 <= getattr(self.reward, name) < math.inf, amount) for name in sorted(costs)}
-        required["axes"] = weighed, "six finite numbers >= 0, some more than 0"
+        required["axes"] = usable, "six finite numbers >= 0, some more than 0"
         check_settings("RewardConfig", self.reward, required)
 
         # Settings of MJX-Warp and of the pipe

@@ -7,6 +7,13 @@ MJX simulates both, see `EnvConfig.engine`.
 
 from __future__ import annotations
 
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,24 +21,80 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.lazy import brax_envs, put
-from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.poses import PosePool
 from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeMotion, EpisodeNoise, State
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mechanics import mjx_rest
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.motion import midpoint, mjx_step
-from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm
+from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm, Path
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
+from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, arms_at_once, settle
-from mjx_softarm.mechanics.workspace import Pool
+from mjx_softarm.mechanics.workspace import Pool, Seed, sample_evenly, sample_workspace
+from mjx_softarm.posture import hangs
 from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, correct
+from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.spec import ArmSpec
+
+
+class PosePool:
+    """Poses of the workspace, a share of them uniform in volume; they are settled at the first use.
+
+    A compiled function that takes them as an argument is compiled while they settle, and is the same program
+    for all pools of one size.
+
+    Args:
+        spec: the arm.
+        config: number of poses, share and seed.
+        observed: function from poses and spring lengths to the poses that are observed.
+    """
+
+    def __init__(self, spec: ArmSpec, config: EnvConfig, observed: Callable[[Array, Array], Array]):
+        self._spec, self._config, self._observed = spec, config, observed
+        self._settled, self._given = (
+            functools.cache(lambda: self.draw(config.workspace_seed)),
+            ContextVar[Pool | None]("pool", default=None),
+        )
+        sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
+        shapes: Any = (jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes)
+        self.shapes = Pool(*shapes)  # in the places of arrays
+
+    def __call__(self) -> Pool:
+        """Return the poses."""
+        if (given := self._given.get()) is not None:
+            return given
+        with ThreadPoolExecutor(1) as elsewhere:  # the first use may be in a function that is traced
+            return elsewhere.submit(self._settled).result()
+
+    @contextlib.contextmanager
+    def given(self, pool: Pool) -> Iterator[None]:
+        """Return other poses, such as an argument of a traced function, meanwhile and in this thread."""
+        before = self._given.set(pool)
+        try:
+            yield
+        finally:
+            self._given.reset(before)
+
+    def draw(self, seed: Seed) -> Pool:
+        """Draw as many poses as the pool has, onto the device."""
+        n_even = round(self._config.even_share * self._config.n_poses)
+        counts = (self._config.n_poses - n_even, False), (n_even, True)
+        parts = [self.sample(n, seed, evenly) for n, evenly in counts if n]
+        return jax.device_put(jax.tree.map(lambda *part: np.concatenate(part), *parts))
+
+    def sample(self, n: int, seed: Seed, evenly: bool = False) -> Pool:
+        """Draw n poses with `sample_workspace` or `sample_evenly`, as they are observed, as NumPy arrays.
+
+        NumPy, because JAX compiles a program for each operation outside of a compiled function.
+        """
+        pool = (sample_evenly if evenly else sample_workspace)(self._spec, n, seed)
+        return pool._replace(pose=np.float32(self._observed(pool.pose, pool.spring_m)))
 
 
 class ReachEnv(brax_envs.Env):
@@ -80,7 +143,13 @@ class ReachEnv(brax_envs.Env):
         self.episode_motion = EpisodeMotion(self.spec, self.config)
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *jax.device_put([np.float32(limit) for limit in limits]))
-        self.walls = Walls(self.config.pipe, self.spec, self.params, s2r)
+        self.pipe = self.config.pipe
+        if self.pipe is not None and not hangs(self.spec):
+            raise InputError(
+                f"pipe_diameter_mm: got {1e3 * self.pipe.diameter_m:g} for the arm {self.spec.name!r}, whose "
+                f"base is turned by {self.spec.mounting.base_turn_deg} deg, expected an arm that hangs: "
+                "pipes are entered from above"
+            )
 
         # Simulation, and the poses that starts and goals are drawn from
         self.uses_mjx = self.config.engine != "chain"
@@ -177,7 +246,7 @@ class ReachEnv(brax_envs.Env):
         terms = rewards.reward(arm.pose, goal, arm.n_steps, jnp.array(False), self.config.reward)[2]
         metrics |= {f"reward_{name}": zero for name in terms}
         info = {"saturated": jnp.array(False), "blocked": jnp.zeros(self.spec.n_chambers, bool)}
-        info |= {"valid": jnp.array(True), "clearance_mm": self.walls.clearance_mm(start.q, start.pose)}
+        info |= {"valid": jnp.array(True), "clearance_mm": self._clearance_mm(start.q, start.pose)}
         if self.config.moves:
             info["path_mm"] = jnp.zeros((self.n_ticks, 3))
         return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
@@ -258,13 +327,35 @@ class ReachEnv(brax_envs.Env):
 
     def _way(self, arm: ArmState, end: Settled | MotionEnd, valid: Array) -> dict[str, Array]:
         """Return the clearance and, in motion, the path of `info`."""
-        clearance_mm = self.walls.clearance_mm(arm.motion.q, arm.pose)
+        clearance_mm = self._clearance_mm(arm.motion.q, arm.pose)
         if not isinstance(end, MotionEnd):
             return {"clearance_mm": clearance_mm}
         tips = pose_from_frame(end.path.tip_position_m, end.path.tip_rotation)
         pose = self._observed_pose(tips, end.path.spring_m)  # (n_ticks, 6)
-        least_mm = jnp.minimum(clearance_mm, self.walls.least_mm(end.path, pose))
+        least_mm = jnp.minimum(clearance_mm, self._least_clearance_mm(end.path, pose))
         return {"path_mm": pose[:, :3], "clearance_mm": jnp.where(valid, least_mm, clearance_mm)}
+
+    def _clearance_mm(self, q: Array, pose: Array) -> Array:
+        """Return the distance () of the body to the pipe at coordinates (nv,), with its tip at a pose (6,).
+
+        Without a pipe, distances are infinite.
+        """
+        if self.pipe is None:
+            return jnp.asarray(jnp.inf, q.dtype)
+        frames = chain_kinematics(self.params)(q)
+        return self._of_plates(self.pipe, frames.plate_position, frames.plate_rotation, pose)
+
+    def _least_clearance_mm(self, path: Path, pose: Array) -> Array:
+        """Return the least distance () along a path whose tips have poses (t, 6), without its start."""
+        if self.pipe is None or len(pose) == 1:  # nothing between start and end
+            return jnp.asarray(jnp.inf, pose.dtype)
+        plates = path.plate_position_m[1:], path.plate_rotation[1:]
+        return jnp.min(self._of_plates(self.pipe, *plates, pose[1:]))
+
+    def _of_plates(self, pipe: CrossPipe, position_m: Array, rotation: Array, pose: Array) -> Array:
+        if self.s2r is not None:
+            position_m, rotation = carry_body(position_m, rotation, pose)
+        return 1e3 * body_clearance(pipe, position_m, rotation, self.spec)
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
         """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""

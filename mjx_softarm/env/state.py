@@ -66,14 +66,14 @@ class EpisodeMotion:
     """Parameters and states at rest of the arms of a configuration, which may be in motion."""
 
     def __init__(self, spec: ArmSpec, config: EnvConfig):
-        self._spread, own = config.randomisation, spec.actuators.per_chamber(spec.n_chambers)
-        self._regulated = isinstance(own, Regulator)
-        self._actuators: Any = jax.device_put(jax.tree.map(np.float32, own))
+        self._spread, actuators = config.randomisation, spec.actuators.per_chamber(spec.n_chambers)
+        self._regulated = isinstance(actuators, Regulator)
+        self._actuators: Any = jax.device_put(jax.tree.map(np.float32, actuators))
         self.n_draws = 6 if self._regulated else 3  # random numbers of an episode
 
         # Commands that wait at a time, and those of an arm at rest; an arm that is always at rest needs none
         spread = 1.0 + self._spread.regulator_spread * self._regulated
-        longest_s = spread * float(np.max(own.delay_s)) + self._spread.delay_max_s
+        longest_s = spread * float(np.max(actuators.delay_s)) + self._spread.delay_max_s
         self.n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.moves else 0
         self._offset_kpa = self._actuators.rest_offset_kpa if config.moves else None
 

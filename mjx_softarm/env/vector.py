@@ -27,9 +27,11 @@ def over_arms(function: Callable, mesh: Mesh | None = None, n_shared: int = 0) -
         all_arms = jax.vmap(function, in_axes=(0,) * n_own + (None,) * n_shared)
         if mesh is None:
             return all_arms(*arguments)
-        own, shared = PartitionSpec(mesh.axis_names), PartitionSpec()
-        specs = (own,) * n_own + (shared,) * n_shared
-        return jax.shard_map(all_arms, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)(*arguments)
+        per_arm, shared = PartitionSpec(mesh.axis_names), PartitionSpec()
+        specs = (per_arm,) * n_own + (shared,) * n_shared
+        return jax.shard_map(all_arms, mesh=mesh, in_specs=specs, out_specs=per_arm, check_vma=False)(
+            *arguments
+        )
 
     return of_all
 

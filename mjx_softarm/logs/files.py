@@ -114,8 +114,8 @@ def refuse(findings: Sequence[Finding]) -> None:
 
 def _reading_name(names: list[str]) -> str:
     """Return the name of a file's readings, or that of the default arm if the file has no readings."""
-    found = [sensor.reading_name for sensor in SENSORS.values()]
-    return next((x for x in found if any(re.fullmatch(rf"{x}\d+", name) for name in names)), found[0])
+    known = [sensor.reading_name for sensor in SENSORS.values()]
+    return next((x for x in known if any(re.fullmatch(rf"{x}\d+", name) for name in names)), known[0])
 
 
 def _header_errors(

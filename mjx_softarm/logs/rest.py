@@ -34,7 +34,7 @@ def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) 
         pressure_kpa (n, n_chambers): commanded pressures.
         payload_kg (n,): payload.
     """
-    n, start, found = len(time_s), 0, []
+    n, start, spans = len(time_s), 0, []
     breaks = np.flatnonzero((np.diff(time_s) > MIN_HOLD_S) | (np.diff(payload_kg) != 0)) + 1
     while start < n:
         later = breaks[np.searchsorted(breaks, start, side="right") :]
@@ -47,9 +47,9 @@ def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) 
             if left.any():
                 break
             width *= 2
-        found.append((start, stop))
+        spans.append((start, stop))
         start = stop
-    return found
+    return spans
 
 
 def leaves(pressure_kpa: np.ndarray, first_kpa: np.ndarray) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,21 +23,20 @@ class Table(NamedTuple):
     row: np.ndarray  # (n,) line of the file, counted from 1; the first row of an npz file is line 2
 
 
-def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
+def read_table(path: str | Path) -> Table:
     """Read a CSV file, or an npz file as `mjx_softarm.logs.schema` describes it.
 
     A number that float32 cannot hold becomes infinite, which the readers of logs refuse.
 
     Args:
         path: CSV file, or an npz file with the suffix `.npz`.
-        names: names of the columns of a CSV file without a header.
 
     Raises:
         LogError: the file cannot be read.
     """
     path = Path(path)
     try:
-        table = _read_npz(path) if path.suffix == ".npz" else _read_csv(path, names)
+        table = _read_npz(path) if path.suffix == ".npz" else _read_csv(path)
     except OSError as error:
         raise _error(path, f"got {error.strerror or str(error)!r}, expected a log") from error
     table.values[np.abs(table.values) > FLOAT32_MAX] = np.inf
@@ -65,23 +63,22 @@ def _read_npz(path: Path) -> Table:
     return Table(tuple(map(str, columns)), values.astype(np.float64), np.arange(len(values)) + 2)
 
 
-def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
-    # Header: the first line names the columns, unless `names` does.
+def _read_csv(path: Path) -> Table:
+    # Header: the first line names the columns.
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     _check_text(path, head)
     first = head.decode("utf-8-sig", errors="replace").splitlines()[0]
-    n_header = 0 if names else 1
-    names = tuple(names or (name.strip() for name in first.split(",")))
+    names = tuple(name.strip() for name in first.split(","))
     if "," not in first:
-        found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
-        got = f"{found[0]} between the columns" if found else f"one column, {first[:60]!r}"
+        delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
+        got = f"{delimiters[0]} between the columns" if delimiters else f"one column, {first[:60]!r}"
         raise _error(path, f"got {got}, expected columns parted by commas, and decimal points", 1)
     # Lines: blank ones are skipped, empty cells are NaN, any other text is an error.
     values, row = [], []
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
-            if number <= n_header or not line.strip():
+            if number == 1 or not line.strip():
                 continue
             cells = line.rstrip("\r\n").split(",")
             if len(cells) != len(names):
@@ -125,6 +122,6 @@ def _check_text(path: Path, head: bytes) -> None:
 
 
 def _ragged(line: str, n_cells: int, n_names: int) -> str:
-    found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
-    hint = f" and {found[0]}" if found else " (decimal commas?)" if n_cells >= 1.5 * n_names else ""
+    delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
+    hint = f" and {delimiters[0]}" if delimiters else " (decimal commas?)" if n_cells >= 1.5 * n_names else ""
     return f"got {n_cells} cells{hint}, expected {n_names} as in the header"

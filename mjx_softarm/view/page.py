@@ -63,7 +63,7 @@ class Page:
         limits = Limits.of(spec, setup.policy.tolerance_m)
         set_the_scene(server, spec)
         self._stage = Stage(server.scene, spec, limits)
-        points, hull = add_workspace(server.scene, setup.policy.workspace)
+        points = add_workspace(server.scene, setup.policy.workspace)
         look = {"scale": 0.15, "depth_test": False, "visible": False}
         self._gizmo = server.scene.add_transform_controls("/gizmo", **look)
         # Panel beside it.
@@ -82,7 +82,6 @@ class Page:
             if setup.carries:
                 self._add_payload(round(1e3 * spec.mass.largest_payload_kg))
             add_box(server.gui, "reachable poses", False, points, "Goals are kept near them")
-            add_box(server.gui, "reachable workspace", False, hull, "The hull of the reachable poses")
         self._listen()
 
     def _button(self, label: str, name: str, hint: str, icon: Any, colour: Any = None) -> None:

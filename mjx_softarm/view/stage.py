@@ -10,26 +10,27 @@ from collections import deque
 from typing import Any
 
 import numpy as np
+import trimesh
 import viser
+from trimesh import creation
 
 from mjx_softarm.mechanics.body import (
     COILS,
     FOLDS,
     SPRING_WIDTH_M,
     Copies,
+    gripper_boxes,
     payload_radius_m,
     shape,
 )
 from mjx_softarm.posture import base_rotation, posture
 from mjx_softarm.sensing.pose import quaternion_from_pose, quaternion_from_rotation
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.view import meshes
 from mjx_softarm.view.look import Limits, Look
 
 SECTION_COLOURS = ((214, 90, 66), (235, 172, 70), (70, 140, 200))  # as in MuJoCo's pictures
 SATURATED, GOAL, SEEN = (226, 38, 77), (40, 160, 96), (124, 77, 210)
 _RING, _SPRING, _GRIPPER, _MOUNT = (62, 66, 74), (176, 182, 190), (52, 55, 62), (142, 147, 155)
-_HULL = (70, 130, 200)
 _PAYLOAD, _TRAIL = (52, 150, 66), (245, 130, 32)
 _TRAIL_POINTS, _TRAIL_STEP_M = 300, 2e-3
 _RING_M, _WIRE_M, _MOUNT_M = 0.005, 7e-4, (0.095, 0.04)  # height; radius; radius and height
@@ -59,11 +60,11 @@ class Stage:
         self._marked: np.ndarray | None = None  # (n_chambers,) bool, chambers drawn as saturated
         scene.add_frame(name, show_axes=False, position=place_m)
 
-        def solid(path: str, mesh: meshes.Mesh, colour, **options: Any):
+        def solid(path: str, mesh: trimesh.Trimesh, colour, **options: Any):
             vertices, faces = mesh.vertices, mesh.faces
             return scene.add_mesh_simple(f"{name}/{path}", vertices, faces, color=colour, **options)
 
-        def copies(path: str, mesh: meshes.Mesh, at: Copies, colour):
+        def copies(path: str, mesh: trimesh.Trimesh, at: Copies, colour):
             batch = mesh.vertices, mesh.faces, at.quaternion, at.position_m
             colours = np.tile(np.array(colour, np.uint8), (len(at.pitch_m), 1))
             looks = {"batched_scales": at.scales, "batched_colors": colours, "lod": "off"}
@@ -77,21 +78,21 @@ class Stage:
         length_m = spec.length_m / spec.structure.n_sections
         self._spring_m = spec.at_springs(spec.geometry.section_length_m)  # lengths in the last picture
         rest = shape(spec, self._spring_m, np.full(6, np.nan))
-        turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, length_m / COILS)
+        turn = _coil(1.6 * SPRING_WIDTH_M, _WIRE_M, length_m / COILS)
         base = base_rotation(spec)
         behind = base @ (0.0, 0.0, _MOUNT_M[1] / 2) + spec.mounting.base_offset_m
         turned = quaternion_from_rotation(base)
-        solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=behind, wxyz=turned)
-        self._rings = copies("rings", meshes.disc(1.0, _RING_M), rest.rings, _RING)
-        self._folds = copies("bellows", meshes.fold(1.0), rest.folds, _RING)
+        solid("mount", _disc(*_MOUNT_M), _MOUNT, position=behind, wxyz=turned)
+        self._rings = copies("rings", _disc(1.0, _RING_M), rest.rings, _RING)
+        self._folds = copies("bellows", _fold(1.0), rest.folds, _RING)
         self._coils = copies("springs", turn, rest.coils, _SPRING)
         # Tip, seen tip and goal, each with a gripper; payload, markers and trail.
         self._tip = scene.add_frame(f"{name}/tip", show_axes=False)
         self._seen = scene.add_frame(f"{name}/seen", show_axes=False)
         self._goal = scene.add_frame(f"{name}/goal", show_axes=False)
-        solid("tip/gripper", meshes.gripper(spec), _GRIPPER, flat_shading=True)
+        solid("tip/gripper", _gripper(spec), _GRIPPER, flat_shading=True)
         for path, colour in (("seen", SEEN), ("goal", GOAL)):
-            solid(f"{path}/gripper", meshes.gripper(spec), colour, opacity=0.4, flat_shading=True)
+            solid(f"{path}/gripper", _gripper(spec), colour, opacity=0.4, flat_shading=True)
         self._payload = scene.add_icosphere(
             f"{name}/tip/payload", 1.0, color=_PAYLOAD, position=(0.0, 0.0, -spec.mass.gripper_length_m)
         )
@@ -131,9 +132,45 @@ class Stage:
         """Colour the bellows; send a message only if the colours change."""
         if self._marked is None or not np.array_equal(saturated, self._marked):
             self._marked = saturated
-            own = np.array(section_colours(len(saturated), self._limits.n_sections))
-            colour = np.where(saturated[:, None], SATURATED, own).astype(np.uint8)
+            colours = np.array(section_colours(len(saturated), self._limits.n_sections))
+            colour = np.where(saturated[:, None], SATURATED, colours).astype(np.uint8)
             self._folds.batched_colors = np.repeat(colour, FOLDS, axis=0)
+
+
+def _disc(radius_m: float, height_m: float) -> trimesh.Trimesh:
+    """Return a flat cylinder about z."""
+    return creation.cylinder(radius_m, height_m, sections=48)
+
+
+def _fold(radius_m: float) -> trimesh.Trimesh:
+    """Return one convolution of a bellows about z, of height 1."""
+    height = np.linspace(-0.5, 0.5, 7)
+    profile = np.stack([radius_m * (0.86 + 0.14 * np.cos(2 * np.pi * height)), height], axis=-1)
+    return creation.revolve(profile, sections=18)
+
+
+def _coil(radius_m: float, wire_m: float, pitch_m: float) -> trimesh.Trimesh:
+    """Return one turn of a spring about z, of height 1; stretched to the pitch, its wire is round."""
+    n, n_wire = 13, 4  # points along the turn, and around the wire
+    along, about = np.meshgrid(np.linspace(0, 2 * np.pi, n), 2 * np.pi * np.arange(n_wire) / n_wire)
+    out = radius_m + wire_m * np.cos(about)
+    height = along / (2 * np.pi) - 0.5 + wire_m / pitch_m * np.sin(about)
+    vertices = np.stack([out * np.cos(along), out * np.sin(along), height], axis=-1)  # (n_wire, n, 3)
+    here = np.arange(n_wire * n).reshape(n_wire, n)
+    a, c = here[:, :-1], here[:, 1:]
+    b, d = (np.roll(side, -1, axis=0) for side in (a, c))
+    faces = np.concatenate([np.stack([a, c, b], axis=-1), np.stack([b, c, d], axis=-1)])
+    return trimesh.Trimesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), process=False)
+
+
+def _gripper(spec: ArmSpec) -> trimesh.Trimesh:
+    """Return the gripper below the tip, in the tip's frame."""
+    middle = np.array([0.0, 0.0, -spec.mass.gripper_length_m / 2])
+    boxes = [
+        creation.box(bounds=middle + centre_m + np.array([-half_m, half_m]))
+        for half_m, centre_m in gripper_boxes(spec).values()
+    ]
+    return trimesh.util.concatenate(boxes)  # pyright: ignore[reportReturnType]
 
 
 def section_colours(n: int, n_sections: int) -> list[tuple[int, int, int]]:
@@ -141,16 +178,12 @@ def section_colours(n: int, n_sections: int) -> list[tuple[int, int, int]]:
     return [SECTION_COLOURS[k * n_sections // n % len(SECTION_COLOURS)] for k in range(n)]
 
 
-def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> tuple[viser.SceneNodeHandle, ...]:
-    """Add the reachable poses (m, 6) [mm, deg], darker with depth, and their hull; both hidden."""
+def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> viser.SceneNodeHandle:
+    """Add the reachable poses (m, 6) [mm, deg], darker with depth; hidden."""
     depth = (pose[:, 2:3].max() - pose[:, 2:3]) / max(float(np.ptp(pose[:, 2])), 1.0)
     colours = (depth * (38, 84, 160) + (1 - depth) * (120, 200, 235)).astype(np.uint8)
     looks = {"point_size": 0.004, "point_shape": "circle", "visible": False}
-    points = scene.add_point_cloud("/workspace", 1e-3 * pose[:, :3], colours, **looks)
-    surface = meshes.workspace_hull(1e-3 * pose[:, :3].astype(float))
-    looks = {"color": _HULL, "opacity": 0.2, "side": "double", "visible": False, "cast_shadow": False}
-    hull = scene.add_mesh_simple("/hull", surface.vertices, surface.faces, **looks)
-    return points, hull
+    return scene.add_point_cloud("/workspace", 1e-3 * pose[:, :3], colours, **looks)
 
 
 def open_server(host: str, port: int, label: str) -> viser.ViserServer:

@@ -86,7 +86,7 @@ def test_an_arm_s_computer_needs_numpy_alone(file):
 
 def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, monkeypatch):
     nowhere = Pool(*[np.zeros((1, 6))] * 4)  # the arm does not move here
-    monkeypatch.setattr("mjx_softarm.env.poses.sample_workspace", lambda *_: nowhere)
+    monkeypatch.setattr("mjx_softarm.env.reach.sample_workspace", lambda *_: nowhere)
     env = ReachEnv(spec)
     action = mode(
         Actor(9, activation=runner.policy.activation).apply(

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from calib.fit.sensors import fit_springs
+from calib.fit.springs import fit_springs
 from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.arm_io import Capture
@@ -70,8 +70,8 @@ def test_recorded_voltages_calibrate_the_wires(tmp_path):
     assert "voltage0 [V]" in (tmp_path / "springs.csv").read_text().splitlines()[0]
     log, _ = read_log(tmp_path / "springs.csv")
     fit = fit_springs(log.readings_of(SPEC.sensor), log.spring_m, SPEC.spring_sensor)
-    np.testing.assert_allclose(fit.beta, BETA, rtol=5e-3)
-    np.testing.assert_allclose(fit.delta_m, DELTA_M, atol=1e-3)
+    np.testing.assert_allclose(fit.slope, BETA, rtol=5e-3)
+    np.testing.assert_allclose(fit.offset, DELTA_M, atol=1e-3)
     with pytest.raises(LogError, match="voltage0: got readings of voltage, expected frequency"):
         log.readings_of(ArmSpec.default().sensor)
 

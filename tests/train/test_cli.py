@@ -251,7 +251,7 @@ def test_imitation_hands_its_reward_and_its_layers_on(arm, demonstrations, tmp_p
     imitate = ["imitate", demonstrations, *flags(**changes), *settings, "--out"]
     donor, heir = tmp_path / "donor", tmp_path / "heir"
     assert main([*imitate, str(donor)]) == 0
-    assert all((donor / name).exists() for name in ("learning_curve.png", "losses.png", "positions.png"))
+    assert all((donor / name).exists() for name in ("learning_curve.png", "positions.png"))
     assert len(json.loads((donor / "evaluation.json").read_text())["error_mm"]) == 6
 
     capsys.readouterr()

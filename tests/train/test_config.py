@@ -7,7 +7,6 @@ import pytest
 
 from mjx_softarm._support.errors import InputError
 from train.agent.analytic import AnalyticConfig
-from train.agent.registry import LEARNERS, check_configs
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig, from_dict, override, to_dict
 from train.presets import IMITATION_PRESETS, PRESETS
@@ -99,9 +98,3 @@ def test_each_stages_end_is_evaluated(imitation_config):
     learner = dataclasses.replace(imitation_config.learner, total_env_steps=160)  # 10 epochs
     config = dataclasses.replace(imitation_config, learner=learner, evaluation_epochs=4)
     assert [epoch for epoch in range(1, 11) if config.evaluates_after(epoch)] == [4, 5, 8, 10]
-
-
-def test_two_learners_with_one_type_of_config_are_refused():
-    """A run's JSON names its learner by that type."""
-    with pytest.raises(TypeError, match="got TQCConfig for tqc and mine, expected a type for each"):
-        check_configs({**LEARNERS, "mine": LEARNERS["tqc"]._replace(epoch=LEARNERS["analytic"].epoch)})

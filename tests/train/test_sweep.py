@@ -23,9 +23,8 @@ from train.config import override
 from train.epoch.job import Job
 from train.presets import PRESETS
 from train.runs import plots
-from train.runs.checkpoint import Checkpoints
 from train.runs.evaluate import Summary
-from train.runs.folder import Run
+from train.runs.folder import Checkpoints, Run
 from train.runs.task import Task
 from train.sweep import RESULTS_FILE, MembersEpoch, members_of, open_members, report, setting, variable
 

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_softarm.deploy.loop import start
 from mjx_softarm.logs.schema import write_log
-from mjx_softarm.view.taken_poses import TakenPoses
+from mjx_softarm.view.live import TakenPoses
 from tests.linear_arm import CONTROLLER, HIGH_KPA, POLICY, REST_M, SENSOR, SPEC, N
 from train.demos.demonstrations import load_demonstrations
 

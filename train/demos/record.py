@@ -20,8 +20,7 @@ from mjx_softarm.deploy.link import ArmFault, Recorder
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
 from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
-from train.demos.expert import Expert, ExpertError
-from train.demos.posture import Posture, PostureTarget
+from train.demos.expert import Expert, ExpertError, Posture, PostureTarget
 from train.demos.waypoints import Waypoint
 
 CLOSE_M = 1.5e-3  # error of the finger tips below which nothing is corrected

@@ -119,18 +119,6 @@ class Learner(Protocol):
         ...
 
 
-class Goals(Protocol):
-    """Distribution of the starts and goals of new episodes."""
-
-    def init(self) -> Any:
-        """Return the first state of the distribution, a pytree of arrays."""
-        ...
-
-    def begin(self, state: Any, arms: State, key: Array) -> State:
-        """Return the states of n arms; those whose episode is new have a start and goal drawn by `key`."""
-        ...
-
-
 class ReplayState(NamedTuple):
     """All that a run consists of; with it, a run continues bit for bit."""
 
@@ -149,7 +137,7 @@ class ReplayEpoch:
         config: settings.
         env: the arm.
         learner: learner.
-        goals: distribution of starts and goals; None: as the environment draws them.
+        goals: `train.agent.imitation.DemonstratedGoals`; None: as the environment draws starts and goals.
         mesh: devices, if there are several. Raises InputError for what cannot be split evenly.
     """
 
@@ -158,7 +146,7 @@ class ReplayEpoch:
         config: ReplayConfig,
         env: ReachEnv,
         learner: Learner,
-        goals: Goals | None = None,
+        goals: Any = None,
         mesh: Mesh | None = None,
     ):
         self.config, self.env, self.learner, self.goals, self.mesh = config, env, learner, goals, mesh

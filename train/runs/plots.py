@@ -28,17 +28,10 @@ def pictures(
     rows: list[dict[str, Any]], result: Reached | AtPositions, *circle: Reached
 ) -> dict[str, Figure]:
     """Return the pictures of a run, by file name, from its metrics and the results of its evaluation."""
+    curve = {"learning_curve.png": learning_curve(rows)}
     if isinstance(result, AtPositions):
-        return {
-            "learning_curve.png": imitation_curve(rows),
-            "losses.png": losses(rows),
-            "positions.png": positions_figure(result),
-        }
-    return {
-        "learning_curve.png": learning_curve(rows),
-        "circle.png": circle_figure(*circle),
-        "workspace_error.png": workspace_figure(result),
-    }
+        return curve | {"positions.png": positions_figure(result)}
+    return curve | {"circle.png": circle_figure(*circle), "workspace_error.png": workspace_figure(result)}
 
 
 def dress(axes: Any, title: str, x: str, y: str) -> None:
@@ -72,25 +65,27 @@ def logarithmic(axes: Any) -> None:
 def _evaluations(
     axes: Any, rows: list[dict[str, Any]], factor: float, lines: dict[str, tuple[str, str]]
 ) -> None:
-    """Draw figures of the evaluations over environment steps: name -> colour and label."""
+    """Draw figures of the evaluations over environment steps, where they have them: name -> colour, label."""
     evaluated = [row for row in rows if "evaluation/median_mm" in row]
     steps = [row["env_steps"] for row in evaluated]
     for name, (colour, label) in lines.items():
-        values = [factor * row[f"evaluation/{name}"] for row in evaluated]
-        axes.plot(steps, values, "o-", markersize=3, color=colour, label=label)
+        if all(f"evaluation/{name}" in row for row in evaluated):
+            values = [factor * row[f"evaluation/{name}"] for row in evaluated]
+            axes.plot(steps, values, "o-", markersize=3, color=colour, label=label)
     axes.legend(frameon=False, loc="upper right")
 
 
 def learning_curve(rows: list[dict[str, Any]]) -> Figure:
-    """Draw held-out tip error and success over environment steps."""
+    """Draw tip error and success at held-out goals, or demonstrated positions, over environment steps."""
     figure, (left, right) = _figure(
         10,
-        ("tip error on held-out goals", STEPS, "mm"),
+        ("tip error at the goals", STEPS, "mm"),
         ("goals reached, chambers saturated", STEPS, "%"),
     )
     errors = {
         "median_mm": (BLUE, "median"),
         "p95_mm": (ORANGE, "95 %"),
+        "max_mm": (ORANGE, "largest"),
         "circle_mean_mm": (GREY, "circle, mean"),
     }
     _evaluations(left, rows, 1, errors)
@@ -98,9 +93,10 @@ def learning_curve(rows: list[dict[str, Any]]) -> Figure:
     shares = {
         "reached_share": (BLUE, "goals reached"),
         "saturated_share": (ORANGE, "goals with a saturated chamber"),
+        "success_share": (GREY, "reached, unsaturated, inside the pipe"),
     }
     _evaluations(right, rows, 100, shares)
-    right.set_ylim(0, 100)
+    right.set_ylim(0, 105)
     return figure
 
 
@@ -158,33 +154,6 @@ def workspace_figure(workspace: Reached) -> Figure:
         axes.plot(np.maximum([quantile, quantile], low), [0, percent], color=colour, linewidth=1, label=label)
     axes.set_ylim(0, 100)
     axes.legend(frameon=False, loc="upper left")
-    return figure
-
-
-def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
-    """Draw success and tip error at the demonstrated poses over environment steps."""
-    figure, (left, right) = _figure(
-        10, ("demonstrated poses reached", STEPS, "%"), ("tip error at the poses", STEPS, "mm")
-    )
-    shares = {
-        "success_share": (BLUE, "unsaturated, inside the pipe"),
-        "reached_share": (GREY, "the pose alone"),
-    }
-    _evaluations(left, rows, 100, shares)
-    left.set_ylim(0, 105)
-    _evaluations(right, rows, 1, {"median_mm": (BLUE, "median"), "max_mm": (ORANGE, "largest")})
-    logarithmic(right)
-    return figure
-
-
-def losses(rows: list[dict[str, Any]]) -> Figure:
-    """Draw all metrics of the learner that are losses over environment steps."""
-    names = list(dict.fromkeys(name for row in rows for name in row if name.endswith("loss")))
-    learned = [row for row in rows if row["updates"] > 0]
-    panels = [(name.split("/")[1].replace("_", " "), STEPS, "") for name in names]
-    figure, panels = _figure(4 * max(len(names), 1), *panels, height=3.5)
-    for name, axes in zip(names, panels, strict=True):
-        axes.plot([row["env_steps"] for row in learned], [row[name] for row in learned], color=BLUE)
     return figure
 
 

@@ -179,8 +179,8 @@ def with_actuators(spec: ArmSpec, actuators: Actuators) -> ArmSpec:
     swings. On four rods the springs are then within 0.1 mm after 8 s; with the paper's gains one of the rods
     keeps swinging by 11 mm.
     """
-    own = _plain(actuators)
-    spec = spec.replace(actuators={"kind": actuators.kind, **own})
+    values = _plain(actuators)
+    spec = spec.replace(actuators={"kind": actuators.kind, **values})
     if not isinstance(actuators, Regulator) or spec.control.kp_kpa_per_m == 0.0:
         return spec
     slowest = spec.control.kp_kpa_per_m / float(np.mean(actuators.lag_s) + np.mean(actuators.dead_time_s))
@@ -206,8 +206,8 @@ def fit_regulator(
         values = {name: getattr(start, name) * np.exp(shared[k] + own[k]) for k, name in enumerate(_SHARED)}
         values["dead_time_s"] = np.minimum(values["dead_time_s"], LONGEST_DELAY_S)
         # On the way to the best share, one a little beyond the bounds keeps a slope
-        found = Regulator(**values, offset_kpa=offset, volume_share=start.volume_share + shared[-1])
-        return found, arm.of_modes(lags, c)
+        regulator = Regulator(**values, offset_kpa=offset, volume_share=start.volume_share + shared[-1])
+        return regulator, arm.of_modes(lags, c)
 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # Changes of the pressures by shared numbers, and by the offset, of all chambers
@@ -233,19 +233,19 @@ def fit_regulator(
     priors = [SHARED_PRIOR] * len(_SHARED) + [VOLUME_PRIOR] + [OFFSET_PRIOR_KPA] * c
     priors += [CHAMBER_PRIOR] * len(_OWN) * c + [arm.log_std] + [MODE_PRIOR] * (n_lags - 1)
     solution = _fit(model, np.array(priors), runs, used)
-    found, lag_s = numbers(solution.x)
-    share = float(np.clip(found.volume_share, 0.0, 1.0))
-    return dataclasses.replace(found, volume_share=share), lag_s, solution
+    regulator, lag_s = numbers(solution.x)
+    share = float(np.clip(regulator.volume_share, 0.0, 1.0))
+    return dataclasses.replace(regulator, volume_share=share), lag_s, solution
 
 
 def _fit_pump(runs: Runs, used: np.ndarray, spec: ArmSpec, arm: ArmLag) -> tuple[Pump, np.ndarray]:
     """Fit the flow of pumps, whose valves stay; return them and the arm's lags (modes,) [s]."""
-    own = spec.actuators if isinstance(spec.actuators, Pump) else PAPER_PUMP
+    start = spec.actuators if isinstance(spec.actuators, Pump) else PAPER_PUMP
     n = 3 + spec.structure.n_sections
 
     def numbers(x: np.ndarray) -> tuple[Pump, np.ndarray]:
-        flow = float(own.flow_l_per_min * np.exp(x[0]))
-        return dataclasses.replace(own, flow_l_per_min=flow), arm.of_modes(x[1:], spec.n_chambers)
+        flow = float(start.flow_l_per_min * np.exp(x[0]))
+        return dataclasses.replace(start, flow_l_per_min=flow), arm.of_modes(x[1:], spec.n_chambers)
 
     def errors(x: np.ndarray) -> np.ndarray:
         pump, lag_s = numbers(x)

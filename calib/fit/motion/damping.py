@@ -140,7 +140,7 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
     the end of a part that is too long, until they last `MAX_TOTAL_S` together: a recording begins with small
     motions.
     """
-    found, left = [], _rows(MAX_TOTAL_S, spec)
+    stretches, left = [], _rows(MAX_TOTAL_S, spec)
     shortest = _rows(SETTLING_S + MIN_COUNTED_S, spec)
     for log in logs:
         if log.pressure_kpa is None or log.tip_m is None or len(log) < 2:
@@ -163,9 +163,9 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
             if (np.ptp(pressure[_rows(SETTLING_S, spec) :], axis=0) <= HOLD_KPA).all():
                 continue
             tip = np.stack([np.interp(grid, time_s, log.tip_m[rows, k]) for k in range(3)], axis=1)
-            found.append(Stretch(pressure, tip, float(payload[rows[0]])))
+            stretches.append(Stretch(pressure, tip, float(payload[rows[0]])))
             left -= len(grid)
-    return found
+    return stretches
 
 
 def damped(spec: ArmSpec, x: np.ndarray) -> ArmSpec:

@@ -128,7 +128,7 @@ def _parts(log: Log, spec: ArmSpec, left: int) -> list[Part]:
     base = Frame(np.asarray(params.mount.base_position_m), np.asarray(params.mount.base_rotation))
 
     # Rows at regular times of each part without a gap of times or lengths: a row less would shorten the lag
-    found, known = [], np.asarray(np.isfinite(spring_m).all(axis=1))
+    parts, known = [], np.asarray(np.isfinite(spring_m).all(axis=1))
     stepped = _after_steps(log)
     for part, _, newest in dense_parts(log, EVERY_S, known[1:] != known[:-1]):
         rows = part[newest][-left:]
@@ -142,9 +142,9 @@ def _parts(log: Log, spec: ArmSpec, left: int) -> list[Part]:
         # A row at which the simulated arm finds no rest has no error, and the rest of the row before it
         tip_mm = np.where((seen & at_rest.valid)[:, None], 1e3 * tip_m[rows], np.nan)
         newest_valid = np.maximum.accumulate(np.where(at_rest.valid, np.arange(len(rows)), 0))
-        found.append((length_m, tip_mm - even_mm, (at_rest.pose[:, :3] - even_mm)[newest_valid]))
+        parts.append((length_m, tip_mm - even_mm, (at_rest.pose[:, :3] - even_mm)[newest_valid]))
         left -= len(rows)
-    return found
+    return parts
 
 
 def _after_steps(log: Log) -> np.ndarray:
@@ -165,12 +165,12 @@ def _counted(part: Part) -> np.ndarray:
 
 def _blocks(parts: Sequence[Part]) -> np.ndarray:
     """Return the block of each row that counts, of all parts one after the other."""
-    found, n = [], 0
+    blocks, n = [], 0
     for part in parts:
         block = np.arange(len(part[0])) // round(BLOCK_S / EVERY_S)
-        found.append(n + block[_counted(part)])
-        n = found[-1].max() + 1
-    return np.unique(np.concatenate(found), return_inverse=True)[1]
+        blocks.append(n + block[_counted(part)])
+        n = blocks[-1].max() + 1
+    return np.unique(np.concatenate(blocks), return_inverse=True)[1]
 
 
 def _squares_mm2(parts: Sequence[Part], lag_s: float) -> np.ndarray:

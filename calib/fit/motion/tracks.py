@@ -1,10 +1,9 @@
 """Parts of logs of the moving arm; tracks of pressures in them, and simulations of actuators along these.
 
 Where a log has no measured pressures, the springs are the gauge: the calibrated arm at rest with these
-    lengths
-would need the pressures y. In motion these lag behind the true ones p, as damping holds the arm back. Each
-mode of a section, its mean pressure and the differences between its chambers, has a time constant T of its
-own:
+lengths would need the pressures y. In motion these lag behind the true ones p, as damping holds the arm back.
+Each mode of a section, its mean pressure and the differences between its chambers, has a time constant T of
+its own:
 
     T y' = p - y.
 
@@ -110,7 +109,7 @@ def find_tracks(
         resting_kpa: pressures (n, c) of the arm at rest with spring lengths (n, n_springs) [m]; takes logs
             without measured pressures. None takes the logs with measured ones.
     """
-    found, left, period_s = [], round(MAX_TOTAL_S * spec.control.rate_hz), 1.0 / spec.control.rate_hz
+    tracks, left, period_s = [], round(MAX_TOTAL_S * spec.control.rate_hz), 1.0 / spec.control.rate_hz
     for log in logs:
         # What was commanded, and what followed: measured pressures or springs
         spring_m: Any = spring_lengths_m(log, spec)
@@ -132,9 +131,9 @@ def find_tracks(
                 for values in (followed, volume_m3)
             )
             pressure_kpa = on_grid if resting_kpa is None else resting_kpa(on_grid)
-            found.append(Track(commanded_kpa[next_row], pressure_kpa, volume))
+            tracks.append(Track(commanded_kpa[next_row], pressure_kpa, volume))
             left -= len(grid)
-    return found
+    return tracks
 
 
 def _interpolated(grid: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -147,8 +146,7 @@ class Runs:
     """Simulations of tracks, many actuators at once.
 
     Errors are arrays (..., clusters, rows) [kPa]: a cluster is a second of a mode of the pressures,
-        NaN-padded. The
-    modes of a second follow each other.
+    NaN-padded. The modes of a second follow each other.
 
     Args:
         tracks: what to follow.

@@ -18,7 +18,6 @@ from mjx_softarm.spec import BONDS
 from tests.arms import OTHER_ARMS
 from tests.calib.fit.planted import (
     SPEC,
-    SPRING_NOISE_M,
     TIP_NOISE_M,
     calibrate_chambers,
     off_by,
@@ -124,7 +123,7 @@ def test_markers_at_the_sections_ends_tell_the_offsets_wherever_they_are_stuck(f
     site_m = np.array([[0.03, 0.0, 0.0], [0.0, 0.04, 0.0], [-0.02, 0.01, 0.0]])
     marker_m = end_markers(planted(), 200, 0, site_m)
     fit = calibrate_chambers(pose_log(planted(), 200, seed=0, spring_m=None, marker_m=marker_m), SPEC)
-    assert fit.has_markers and not fitted_without_springs.has_markers
+    assert fit.scale.shape == (2, 4) and fitted_without_springs.scale.shape == (2, 3)
     assert fit.direction_widths[0] < 0.5 * fitted_without_springs.direction_widths[0]
     assert len(fit.weak) < len(fitted_without_springs.weak)
     # Of offsets up to 5 mm: without springs they are known less well, and the bond is one number more
@@ -188,7 +187,6 @@ def test_held_out_error_is_that_of_the_noise(fitted):
     assert fitted.held_out.n == fitted.is_held_out.sum() == 40
     assert 1.0 < fitted.held_out.translation_mean_mm / (1e3 * 1.6 * TIP_NOISE_M) < 1.5
     assert fitted.held_out_before.translation_mean_mm > 5.0
-    assert fitted.held_out.spring_rms_mm == pytest.approx(1e3 * SPRING_NOISE_M, rel=0.2)
 
 
 def test_intervals_hold_the_planted_numbers_as_often_as_they_say():
@@ -226,7 +224,6 @@ def test_outliers_hardly_matter():
 
 def test_every_row_is_counted_and_held_out_poses_are_contiguous(fitted):
     assert {use: n for use, n in fitted.rows.items() if n} == {"used": 200}
-    assert fitted.n_single == 200
     np.testing.assert_array_equal(fitted.is_held_out, held_out_blocks(200, 5, 0))
     commanded = fitted.spec.springs.length_min_m, fitted.spec.springs.length_max_m
     assert commanded == (np.nanmin(fitted.poses.spring_m), np.nanmax(fitted.poses.spring_m))

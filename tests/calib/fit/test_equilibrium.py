@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.fit.equilibrium import tip_changes
+from calib.fit.chambers import tip_changes
 from calib.fit.parameters import names, spec_at
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.excitation import random_pressures

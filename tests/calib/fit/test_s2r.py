@@ -9,9 +9,18 @@ import pytest
 
 from benchmarks.accuracy.calibration import trunk_errors
 from calib.fit.blocks import held_out_blocks
-from calib.fit.network import OF_ROWS, NetworkConfig, fit_network
 from calib.fit.pose_errors import pose_errors
-from calib.fit.s2r import PRINTED_NETWORK, PROCESS, fit_printed, fit_s2r, moved, simulate_poses
+from calib.fit.s2r import (
+    OF_ROWS,
+    PRINTED_NETWORK,
+    PROCESS,
+    NetworkConfig,
+    fit_network,
+    fit_printed,
+    fit_s2r,
+    moved,
+    simulate_poses,
+)
 from calib.report import sections
 from mjx_softarm._support.training import Schedule
 from mjx_softarm.mechanics.params import ArmParams

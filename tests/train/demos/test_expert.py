@@ -10,8 +10,16 @@ from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import pose_from_frame
 from tests.mechanics.test_fidelity import FAST_GAINS, fast_model, stepped_to_rest
-from train.demos.expert import EASED, LIMIT_SHARE, TOLERANCE_RAD, WAY, ExpertError
-from train.demos.posture import MARGIN_KPA, MARGIN_M, SPRING_MARGIN_M
+from train.demos.expert import (
+    EASED,
+    LIMIT_SHARE,
+    MARGIN_KPA,
+    MARGIN_M,
+    SPRING_MARGIN_M,
+    TOLERANCE_RAD,
+    WAY,
+    ExpertError,
+)
 from train.demos.waypoints import FREE, SQUARE, TASKS, Waypoint, circle, task
 
 PIPE = CrossPipe.of_mm(300)

@@ -14,7 +14,7 @@ from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
 from mjx_softarm.sensing.s2r import S2R_FILE, save_s2r
 from train.__main__ import main
 from train.demos.demonstrations import read_demonstrations
-from train.demos.posture import Posture
+from train.demos.expert import Posture
 from train.demos.record import CLOSE_M, WaypointRecorder
 from train.demos.waypoints import task
 
