@@ -81,21 +81,12 @@ def held_kpa(
         effect_kpa (m, n_chambers) [kPa]: simulated change of these pressures by the arm's payload.
         rng: generator of residuals and factors for each arm; without one, means are returned.
     """
-<<<<<<< HEAD
     residuals = residual(held, spring_m, light_kpa)
     left_kpa, relative = residuals.mean_kpa, np.ones_like(light_kpa)
     if rng is not None:
         root, (m, n) = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
         normal = rng.standard_normal(left_kpa.shape)
         left_kpa = left_kpa + np.sqrt(residuals.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
-=======
-    predicted = residual(held, spring_m, light_kpa)
-    left_kpa, relative = predicted.mean_kpa, np.ones_like(light_kpa)
-    if rng is not None:
-        root, (m, n) = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
-        normal = rng.standard_normal(left_kpa.shape)
-        left_kpa = left_kpa + np.sqrt(predicted.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
->>>>>>> w-less
         relative = rng.multivariate_normal(np.ones(n), factor_covariance(held, n), m)
     return light_kpa + left_kpa.reshape(light_kpa.shape) + held.factor * relative * effect_kpa
 
@@ -139,15 +130,9 @@ def covariances(held: HeldPressures, share: np.ndarray) -> np.ndarray:
     m, s = share.shape
     blocks = share[:, :, None, None] * held.covariance_kpa2
     c = blocks.shape[-1]
-<<<<<<< HEAD
     matrices = np.zeros((m, s, c, s, c))
     matrices[:, np.arange(s), :, np.arange(s)] = np.swapaxes(blocks, 0, 1)
     return matrices.reshape(m, s * c, s * c)
-=======
-    matrix = np.zeros((m, s, c, s, c))
-    matrix[:, np.arange(s), :, np.arange(s)] = np.swapaxes(blocks, 0, 1)
-    return matrix.reshape(m, s * c, s * c)
->>>>>>> w-less
 
 
 def save_pressures(path: Path, held: HeldPressures) -> None:
