@@ -134,7 +134,7 @@ def test_the_readme_s_policy_acts(tmp_path, monkeypatch):
 
 
 # Journeys: the commands of the pages in the order of the site, with fewer poses and steps.
-NAMES = ("your-arm", "why", "calibrate", "train", "demonstrate", "deploy", "export", "see")
+NAMES = ("your-arm", "why", "calibrate", "train", "deploy", "export", "see")
 JOURNEY = ("README.md", *(f"docs/{name}.md" for name in NAMES))
 FEWER = (
     (r"--poses \d+", "--poses 24"),
