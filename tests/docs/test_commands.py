@@ -27,8 +27,8 @@ PAGES = [
     *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")),
 ]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
-# A benchmark and a learner that docs/extend.md adds; see test_extend.py.
-ADDED = ("python -m benchmarks act", "python -m train reach --learner restless")
+# A learner that docs/extend.md adds; see test_extend.py.
+ADDED = "python -m train reach --learner restless"
 WORDS = {"LOGS": "a.csv", "POLICY": "policy.npz", "--goal=...": "--goal=0,0,-600,0,0,0"}  # stand for others
 
 
