@@ -184,6 +184,7 @@ def journey(tmp_path, monkeypatch):
         (demo, "N_STEPS", 3),
         (estimator, "SCHEDULE", estimator.SCHEDULE._replace(n_updates=200)),
         (estimator, "N_TRAINING", 1024),
+        (estimator, "N_JUDGING", 256),
     ):
         monkeypatch.setattr(module, name, value)
     monkeypatch.chdir(tmp_path)
