@@ -27,8 +27,8 @@ PAGES = [
     *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")),
 ]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
-# A benchmark and a learner that docs/extend.md adds; see test_extend.py.
-ADDED = ("python -m benchmarks act", "python -m train reach --learner restless")
+# A learner that docs/extend.md adds; see test_extend.py.
+ADDED = "python -m train reach --learner restless"
 WORDS = {"LOGS": "a.csv", "POLICY": "policy.npz", "--goal=...": "--goal=0,0,-600,0,0,0"}  # stand for others
 
 
@@ -134,7 +134,7 @@ def test_the_readme_s_policy_acts(tmp_path, monkeypatch):
 
 
 # Journeys: the commands of the pages in the order of the site, with fewer poses and steps.
-NAMES = ("your-arm", "why", "calibrate", "train", "demonstrate", "deploy", "export", "see")
+NAMES = ("your-arm", "why", "calibrate", "train", "deploy", "export", "see")
 JOURNEY = ("README.md", *(f"docs/{name}.md" for name in NAMES))
 FEWER = (
     (r"--poses \d+", "--poses 24"),
@@ -184,6 +184,7 @@ def journey(tmp_path, monkeypatch):
         (demo, "N_STEPS", 3),
         (estimator, "SCHEDULE", estimator.SCHEDULE._replace(n_updates=200)),
         (estimator, "N_TRAINING", 1024),
+        (estimator, "N_JUDGING", 256),
     ):
         monkeypatch.setattr(module, name, value)
     monkeypatch.chdir(tmp_path)

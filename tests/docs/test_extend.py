@@ -91,14 +91,6 @@ def test_a_learner(changed):
     assert (learner["name"], learner["random_share"]) == ("restless", 0.2)
 
 
-def test_a_benchmark(changed):
-    folder = changed("A benchmark")
-    (folder / "docs").mkdir()
-    assert "act us" in output(folder, *block("A benchmark", "sh").replace("2000", "10").split()[1:])
-    figures = json.loads((folder / "docs/results/act.json").read_text())["figures"]
-    assert 0.0 < figures["act_us"] < 1e4
-
-
 def test_tqc_swings_pendulums_up():
     page = {"__name__": "page"}
     exec(block("TQC on an environment of yours", "python"), page)
