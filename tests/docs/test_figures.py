@@ -1,0 +1,150 @@
+"""Numbers in the tables of README and Results are those of the files under `docs/results`."""
+
+import functools
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ANGLES = "yaw_deg", "pitch_deg", "roll_deg"
+
+
+@functools.cache
+def figures(name):
+    return json.loads((ROOT / f"docs/results/{name}.json").read_text("utf-8"))["figures"]
+
+
+def spreads(arms, kind, variant):
+    """The figures of a kind of policy over three arms."""
+    [found] = [x for x in figures(f"paper-{arms}")["spreads"] if (x["kind"], x["variant"]) == (kind, variant)]
+    return found
+
+
+def runs(arms, kind, variant):
+    rows = figures(f"paper-{arms}")["runs"]
+    return [row for row in rows if (row["kind"], row["variant"]) == (kind, variant)]
+
+
+def mean(arms, kind, variant, name, digits=2):
+    return f"{spreads(arms, kind, variant)[name]['mean']:.{digits}f}"
+
+
+def both(arms, kind, variant, name="translation_mm"):
+    """Mean and standard deviation."""
+    found = spreads(arms, kind, variant)[name]
+    return f"{found['mean']:.2f} ± {found['std']:.2f}"
+
+
+def row(*cells):
+    return f"| {' | '.join(cells)} |"
+
+
+def circle_rows():
+    """The table *Circle*; rods have no `quick`."""
+    kinds = {
+        "the specification": "specified",
+        "calibrated springs": "without",
+        "springs and chambers": "chambers",
+        "all, with S2R": "with",
+        "all, with S2R, `quick`": "quick",
+        "all, with S2R, `payload`": "payload",
+        "gradient descent, with S2R": "gradient",
+    }
+    for title, kind in kinds.items():
+        cells = [title]
+        for arms in ("open", "rod"):
+            known = any(x["kind"] == kind for x in figures(f"paper-{arms}")["spreads"])
+            angles = "/".join(mean(arms, kind, "0 g", name) for name in ANGLES) if known else ""
+            error = f"{both(arms, kind, '0 g')}, {mean(arms, kind, '0 g', 'rmse_mm')}" if known else ""
+            cells += [error, angles]
+        yield re.sub(r"  +", " ", row(*cells))
+
+
+def load_rows():
+    """The table *Payloads*."""
+    kinds = {"`analytic`": "with", "`payload`": "payload", "`quick`, TQC alone": "quick"}
+    for title, kind in (kinds | {"gradient descent": "gradient"}).items():
+        cells = [title]
+        for arms in ("open", "rod"):
+            if not any(x["kind"] == kind for x in figures(f"paper-{arms}")["spreads"]):
+                cells += [""] * 3
+                continue
+            heavy = spreads(arms, kind, "1000 g")
+            most = max(one["max_mm"] for one in runs(arms, kind, "1000 g"))
+            cells += [
+                both(arms, kind, "500 g"),
+                f"{both(arms, kind, '1000 g')}, {heavy['rmse_mm']['mean']:.2f}, {most:.1f}",
+                "/".join(mean(arms, kind, f"{g} g", "load_off_g", 0) for g in (0, 500, 1000)),
+            ]
+        yield re.sub(r"  +", " ", row(*cells))
+
+
+def lap_rows():
+    """The table *Circle in time*."""
+    for lap_s in (10, 20, 40):
+        cells = [f"{lap_s} s"]
+        for arms in ("open", "rod"):
+            errors = {one["twin"]: one["way_mm"] for one in runs(arms, "with", f"0 g in {lap_s} s")}
+            cells.append(", ".join(f"{errors[arm]:.2f}" for arm in sorted(errors)))
+        yield row(*cells)
+
+
+def pipe_rows():
+    """The table *Pipes*."""
+    for title, kind, variant in (
+        ("300 mm, learned", "pipe", "as shown"),
+        ("300 mm, learned, in motion", "pipe", "as shown in motion"),
+        ("300 mm, hand-made", "hand-made", "as shown"),
+        ("250 mm, hand-made", "narrow-hand-made", "as shown"),
+        ("250 mm, learned in 300 mm", "narrow-learned", "as shown"),
+    ):
+        found = spreads("confined", kind, variant)
+        error = "/".join(f"{found[f'{axis}_mm']['mean']:.2f}" for axis in "xyz")
+        done = f"{found['all_done_runs']} of {found['runs']}"
+        yield row(title, done, error, f"{found['wall_max_n']['max']:.1f}")
+
+
+def held_out_rows():
+    """The table *Held-out goals*."""
+    quick, analytic = figures("demo"), figures("analytic")
+    for title, name, factor, digits in (
+        ("median [mm]", "median_mm", 1, 2),
+        ("95 % [mm]", "p95_mm", 1, 2),
+        ("goals reached [%]", "reached_share", 100, 1),
+        ("goals with a saturated chamber [%]", "saturated_share", 100, 1),
+        ("uniform in volume: median [mm]", "even_median_mm", 1, 2),
+        ("uniform in volume: 95 % [mm]", "even_p95_mm", 1, 2),
+        ("uniform in volume: reached [%]", "even_reached_share", 100, 1),
+        ("circle, mean [mm]", "circle_mean_mm", 1, 2),
+    ):
+        yield row(title, *(f"{factor * made[name]:.{digits}f}" for made in (quick, analytic)))
+
+
+def readme_rows():
+    """The table of README."""
+    twins, rods = (mean(arms, "with", "0 g", "rmse_mm") for arms in ("open", "rod"))
+    yield row("circle of 160 mm: RMSE", f"{twins} mm on twins, {rods} mm on rods", "11.59 mm")
+    heavy = [spreads(arms, "payload", "1000 g")["rmse_mm"]["mean"] for arms in ("open", "rod")]
+    most = max(one["max_mm"] for arms in ("open", "rod") for one in runs(arms, "payload", "1000 g"))
+    yield row(
+        "with 1 kg", f"RMSE {heavy[0]:.2f} and {heavy[1]:.2f} mm", f"at most {most:.1f} mm here, 23.76 mm"
+    )
+    pipe = spreads("confined", "pipe", "as shown")
+    error = "/".join(f"{pipe[f'{axis}_mm']['mean']:.2f}" for axis in "xyz")
+    yield row("in a pipe of 300 mm: error in X/Y/Z", f"{error} mm", "8.93/5.34/5.13 mm")
+
+
+TABLES = {
+    "docs/results.md": (circle_rows, load_rows, lap_rows, pipe_rows, held_out_rows),
+    "README.md": (readme_rows,),
+}
+
+
+@pytest.mark.parametrize(("page", "rows"), [(page, rows) for page, many in TABLES.items() for rows in many])
+def test_tables_are_those_of_the_files(page, rows):
+    lines = (ROOT / page).read_text("utf-8").splitlines()
+    expected = list(rows())
+    assert len(expected) > 2
+    assert [line for line in expected if line not in lines] == []
