@@ -176,10 +176,10 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float | None) -> Bu
 
     # The models' part, of which S2R has as much as at held-out poses
     size = max(float(np.mean(np.linalg.norm(each[:, -1], axis=1) ** 2)), s2r_mm**2)
+    by_s2r = models * s2r_mm**2 / max(size, 1e-12)
     named = dict(zip(("policy", "law", "payload", "springs"), parts, strict=True))
-    named["S2R"] = models * s2r_mm**2 / max(size, 1e-12)
     return Budget(
-        parts_mm=named | {"rest": models - named["S2R"]},
+        parts_mm=named | {"S2R": by_s2r, "rest": models - by_s2r},
         shift_mm=1e3 * shift_m,
         believed_g=1e3 * float(load_kg.mean()),
         payload_g=None if payload_kg is None else 1e3 * payload_kg,
