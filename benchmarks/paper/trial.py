@@ -73,7 +73,9 @@ class Gripper:
             self._arm.attach(hung_kg)
 
     def operate(self, k: int) -> None:
-        """Pick or place at goal k, if its name says so."""
+        """Pick or place at goal k, if its name says so; a rod has no gripper to ask for its place."""
+        if not self.operates[k]:
+            return
         operation, container, finger_m = self._operations[k], self._containers[k], self._finger_m()
         if operation == "pick" and self._held_kg is None and container in self._lying:
             object_m, kg = self._lying[container]
