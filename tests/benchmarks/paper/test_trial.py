@@ -20,11 +20,15 @@ GOALS_M = np.array([[0, 0, -6], [2, 0, -6], [0, 0, -6], [-2, 0, -6], [0, 0, -8],
 PIPE = Trial("pipe", 0, 0, "as shown")
 
 
-class Still(LinearArm):
-    """An arm whose tip is always seen in one place."""
+class Rod(LinearArm):
+    """An arm whose tip is always seen in one place; as a rod it does not say where its tip truly is."""
 
     def motion_capture(self):
         return Capture(np.zeros(3), DOWN, np.zeros((0, 3)))
+
+
+class Still(Rod):
+    """The same arm, with a gripper."""
 
     def tip(self):
         return np.zeros(3), np.eye(3)
@@ -50,6 +54,11 @@ def test_a_lap_in_time_has_distances_from_the_goal_that_moves():
     still, _ = operate(Still(), CONTROLLER, goals, [""] * 3, Trial("with", 0, 0, load_g=30))
     assert "way_mm" not in still and np.shape(still["at_stops"]["error"]) == (3, 6)
     assert still["load_off_g"] == pytest.approx(abs(still["load_estimate_g"] - 30.0))
+
+
+def test_a_rod_is_measured_at_all_goals():
+    row, _ = operate(Rod(), CONTROLLER, GOALS[[0, 1]], [""] * 2, Trial("with", 0, 0))
+    assert row["measured"] == row["points"] == 2
 
 
 def test_goals_that_are_all_refused_end_a_trial():
