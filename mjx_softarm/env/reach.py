@@ -57,13 +57,11 @@ class PosePool:
 
     def __init__(self, spec: ArmSpec, config: EnvConfig, observed: Callable[[Array, Array], Array]):
         self._spec, self._config, self._observed = spec, config, observed
-        self._settled, self._given = (
-            functools.cache(lambda: self.draw(config.workspace_seed)),
-            ContextVar[Pool | None]("pool", default=None),
-        )
+        self._settled = functools.cache(lambda: self.draw(config.workspace_seed))
+        self._given = ContextVar[Pool | None]("pool", default=None)
         sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
         shapes: Any = (jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes)
-        self.shapes = Pool(*shapes)  # in the places of arrays
+        self.shapes = Pool(*shapes)  # stand-ins for arrays
 
     def __call__(self) -> Pool:
         """Return the poses."""
@@ -74,7 +72,7 @@ class PosePool:
 
     @contextlib.contextmanager
     def given(self, pool: Pool) -> Iterator[None]:
-        """Return other poses, such as an argument of a traced function, meanwhile and in this thread."""
+        """Use other poses, such as an argument of a traced function, within this context."""
         before = self._given.set(pool)
         try:
             yield
@@ -353,6 +351,7 @@ class ReachEnv(brax_envs.Env):
         return jnp.min(self._of_plates(self.pipe, *plates, pose[1:]))
 
     def _of_plates(self, pipe: CrossPipe, position_m: Array, rotation: Array, pose: Array) -> Array:
+        """Return distances (...) [mm] of bodies with plates (..., n_links + 1), tips at poses (..., 6)."""
         if self.s2r is not None:
             position_m, rotation = carry_body(position_m, rotation, pose)
         return 1e3 * body_clearance(pipe, position_m, rotation, self.spec)

@@ -30,10 +30,8 @@ from mjx_softarm.sensing.pose import (
 N_CHANGES = 6  # change of a section's end: position [m], Gibbs vector (axis times tangent of half the angle)
 N_PASSES = 2
 POSE_ERROR_MM = 0.1  # error that 95 % of poses shall not exceed; `train export` says where they do
-_COSTS = (
-    *[1] * 3,
-    *[2] * 7,
-)  # of a factor in a term of the polynomial: three of the shape, seven of the load
+# Cost of each variable as a factor in a term of the polynomial: three of the shape, seven of the load
+_COSTS = (*[1] * 3, *[2] * 7)
 _DEGREE = 7  # greatest cost of a term; with 6, turns are three times as far off
 _SMALL_BEND = 1e-8  # square of a bend [rad^2] below which a section counts as straight
 
@@ -43,9 +41,7 @@ class PoseEstimator(NamedTuple):
 
     coefficient: Array  # (n_sections, N_TERMS, N_CHANGES) [m, 1]
     variable_centre: Array  # (n_sections, N_VARIABLES) middle of the range of each of `variables`
-    variable_scale: (
-        Array  # (n_sections, N_VARIABLES) half of it; a variable beyond its range counts as its end
-    )
+    variable_scale: Array  # (n_sections, N_VARIABLES) half of this range, which variables are clipped to
     spring_site_m: Array  # (n_sections, s, 2) holes of the s springs of each section in its rings, x and y
     section_mass_kg: Array  # (n_sections,)
     gripper_mass_kg: Array  # ()
@@ -87,12 +83,12 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     even = sections = arcs(length, bend)
 
     # Changes of each section's end; position and Gibbs vector are continuous where yaw and roll are not
-    load_kg = (
-        xp.zeros_like(length[..., 0, :]) + xp.asarray(load_kg, dtype=length.dtype)[..., None]
-    )  # (..., 1)
+    load_kg = xp.asarray(load_kg, dtype=length.dtype)[..., None]
+    load_kg = xp.zeros_like(length[..., 0, :]) + load_kg  # (..., 1)
     for _ in range(N_PASSES):
         moments = first_moments(estimator, length, sections, load_kg)
-        up, ends = estimator.base_rotation[2] + 0.0 * moments[0], list[Frame]()
+        up = xp.zeros_like(moments[0]) + estimator.base_rotation[2]
+        ends = list[Frame]()
         for k, moment in enumerate(moments):
             x = variables(
                 length[..., k, :], bend[..., k, :], even.rotation[..., k, :, :], up, moment, load_kg
@@ -127,9 +123,8 @@ def first_moments(estimator: PoseEstimator, length: Array, sections: Frame, load
     """
     z = np.eye(3, dtype=length.dtype)[2]
     mass = estimator.gripper_mass_kg + load_kg
-    moment = (
-        -(estimator.gripper_mass_kg * estimator.tool_offset_m[0] + load_kg * estimator.tool_offset_m[1]) * z
-    )
+    gripper_m, payload_m = estimator.tool_offset_m[0], estimator.tool_offset_m[1]
+    moment = -(estimator.gripper_mass_kg * gripper_m + load_kg * payload_m) * z
     moments = [moment]
     for k in reversed(range(1, length.shape[-2])):  # from the tip up
         position_m, rotation = sections.position_m[..., k, :], sections.rotation[..., k, :, :]
@@ -176,22 +171,22 @@ def polynomial_terms(x: Array) -> Array:
 def _products() -> list[tuple[np.ndarray, np.ndarray]]:
     """Return, for products of 1, 2, ... factors, the product of one factor less and the last factor."""
     levels = list[tuple[np.ndarray, np.ndarray]]()
-    last = [(0, 0)]  # by product: place of its last factor, and cost
+    products = [(0,)]  # numbers of the variables; the first product is 1, and any variable may follow
     while True:
         longer = [
-            (place, factor, cost + _COSTS[factor])
-            for place, (least, cost) in enumerate(last)
-            for factor in range(least, len(_COSTS))
-            if cost + _COSTS[factor] <= _DEGREE
+            (place, (*product, factor))
+            for place, product in enumerate(products)
+            for factor in range(product[-1], N_VARIABLES)
+            if sum(_COSTS[k] for k in (*product[1:], factor)) <= _DEGREE
         ]
         if not longer:
             return levels
-        levels.append((np.array([item[0] for item in longer]), np.array([item[1] for item in longer])))
-        last = [item[1:] for item in longer]
+        parents, products = [place for place, _ in longer], [product for _, product in longer]
+        levels.append((np.array(parents), np.array([product[-1] for product in products])))
 
 
-_PRODUCTS = _products()
 N_VARIABLES = len(_COSTS)
+_PRODUCTS = _products()
 N_TERMS = 1 + sum(len(factors) for _, factors in _PRODUCTS)
 
 
@@ -207,7 +202,7 @@ def _from_base(base: Frame, tip: Frame) -> Frame:
 
 
 def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
-    """Return each section's end in the frame of its start, with arguments and results of the two steps."""
+    """Return the ends of sections of constant curvature by their springs; see `section_shapes` and `arcs`."""
     return arcs(*section_shapes(spring_site_m, spring_m))
 
 

@@ -118,6 +118,57 @@ def held_out_rows():
         yield row(title, *(f"{factor * made[name]:.{digits}f}" for made in (quick, analytic)))
 
 
+def main_rows():
+    """The rows of the main table of *Results* whose files have all of their numbers."""
+    circle = (mean(arms, "with", "0 g", "rmse_mm") for arms in ("open", "rod"))
+    here = "{} mm on twins, {} mm on rods".format(*circle)
+    yield row("[Circle](#circle): RMSE of the tip", here, "11.59 mm, the paper's physical arm")
+    heavy = (mean(arms, "payload", "1000 g", "rmse_mm") for arms in ("open", "rod"))
+    most = max(max(values(arms, "payload", "1000 g", "max_mm")) for arms in ("open", "rod"))
+    here = "{} mm on twins, {} mm on rods; largest error {:.1f} mm".format(*heavy, most)
+    yield row("[With 1 kg](#payloads): RMSE", here, "largest 23.76 mm, the paper's arm")
+    here = f"{mean('open', 'with', '0 g in 20 s', 'way_mm', 1)} mm on twins"
+    yield row("[In 20 s](#circle-in-time), without stops: mean", here, "target 2.1 mm")
+    analytic = figures("analytic")
+    here = f"{analytic['median_mm']:.2f}, {analytic['p95_mm']:.2f} mm"
+    title = "[In simulation](#held-out-goals): median, 95 %"
+    yield row(title, here, "RMSE 3.89 mm, the paper's simulated circle")
+    steps = {
+        one["engine"]: f"{one['env_steps_per_s']:,}"
+        for one in json.loads((ROOT / "docs/results/throughput.json").read_text("utf-8"))["rows"]
+        if (one["mode"], one["arms"]) == ("quasistatic", 1024)
+    }
+    here = f"{steps['mjx']} in MJX, {steps['chain']} in closed form"
+    yield row("[Env steps/s](speed.md#env-steps), two CPU cores", here, "the paper at most 467")
+
+
+def arm_rows():
+    """The table *Kinds of arms*."""
+    for title, name, file in (
+        ("the paper's, 600 mm", "paper", "arms"),
+        ("`sopra`, 250 mm", "sopra", "arms"),
+        ("`stiff-flop`, 165 mm", "stiff-flop", "arms"),
+        ("`four-chamber`, 300 mm", "four-chamber", "arms"),
+        (
+            "the paper's, upright ([`arms-upright.json`](results/arms-upright.json))",
+            "upright",
+            "arms-upright",
+        ),
+        (
+            "the paper's, in SoRoMoX ([`arms-soromox.json`](results/arms-soromox.json))",
+            "soromox",
+            "arms-soromox",
+        ),
+    ):
+        made = figures(file)[name]
+        error, most, turn = (made[f"circle, {what}"] for what in ("mean [mm]", "largest [mm]", "mean [deg]"))
+        digits = 2 if error < 1 else 1
+        goals = f"{made['grid, measured']} of {made['grid, goals']}" + " goals" * (name == "paper")
+        circle = f"{error:.{digits}f}; {most:.{digits}f}"
+        share = f"{100 * error / made['length [mm]']:.2f} %"
+        yield row(title, circle, share, f"{turn:.1f}", f"{made['grid, mean [mm]']:.1f} at {goals}")
+
+
 def readme_rows():
     """The table of README."""
     circle = (mean(arms, "with", "0 g", "rmse_mm") for arms in ("open", "rod"))
@@ -129,7 +180,8 @@ def readme_rows():
 
 
 TABLES = {
-    "docs/results.md": (circle_rows, load_rows, lap_rows, pipe_rows, held_out_rows),
+    "docs/results.md": (main_rows, circle_rows, load_rows, lap_rows, pipe_rows, held_out_rows),
+    "docs/trust.md": (arm_rows,),
     "README.md": (readme_rows,),
 }
 

@@ -128,61 +128,66 @@ def distil(arm: CalibratedArm, seed: int, say: Callable[[str], object] = lambda 
 
 def fit_pose(spec: ArmSpec, seed: int) -> PoseEstimator:
     """Return the pose estimator of an arm, least squares over simulated poses with payloads."""
-    # Poses, and the frames between their sections
+    # Poses, with the ends of their sections, and what these are off constant curvature
     pool = sample_loaded(_stronger(spec), _payloads(spec, N_TRAINING, seed), 0.0, seed)
-    params, links = ArmParams.from_spec(spec), spec.structure.links_per_section
-    frames = xla.jit(jax.vmap(chain_kinematics(params)))(pool.q)
-    plate_m, plate = (
-        np.asarray(x, float)[:, ::links] for x in (frames.plate_position, frames.plate_rotation)
-    )
-    start = plate[:, :-1].swapaxes(-1, -2)
-    sections = Frame((start @ np.diff(plate_m, axis=1)[..., None])[..., 0], start @ plate[:, 1:])
-
-    # Variables of the polynomials, and what they have to give
-    n_sections, mount = spec.structure.n_sections, params.mount
-    first = PoseEstimator(
-        coefficient=np.zeros((n_sections, N_TERMS, N_CHANGES)),
-        variable_centre=np.zeros((n_sections, N_VARIABLES)),
-        variable_scale=np.ones((n_sections, N_VARIABLES)),
-        spring_site_m=np.asarray(params.spring_site_m),
-        section_mass_kg=np.asarray(params.link_mass_kg).reshape(n_sections, links).sum(axis=1),
-        gripper_mass_kg=np.asarray(params.tool_mass_kg[0]),
-        tool_offset_m=np.asarray(params.tool_offset_m),
-        base_position_m=np.asarray(mount.base_position_m),
-        base_rotation=np.asarray(mount.base_rotation),
-        tip_offset_m=np.asarray(mount.tip_offset_m),
-        tip_rotation=np.asarray(mount.tip_rotation),
-    )
-    first = jax.tree.map(lambda x: np.asarray(x, float), first)
-    length, bend = section_shapes(first.spring_site_m, np.asarray(pool.spring_m, float))
+    sections, ups = _sections(spec, pool.q)
+    estimator = _first_estimator(spec)
+    length, bend = section_shapes(estimator.spring_site_m, np.asarray(pool.spring_m, float))
     even = arcs(length, bend)
-    turned = quaternion_from_rotation(sections.rotation @ even.rotation.swapaxes(-1, -2))
-    changes = np.concatenate(
-        [sections.position_m - even.position_m, turned[..., 1:] / turned[..., :1]], axis=-1
-    )
-    load_kg = np.asarray(pool.load_kg, float)[:, None]
-    ups = plate[:, :-1, 2]
-    moments = first_moments(first, length, sections, load_kg)
-    sections_x = [
-        variables(length[:, k], bend[:, k], even.rotation[:, k], ups[:, k], moments[k], load_kg)
-        for k in range(n_sections)
-    ]
-    x = np.stack(sections_x, axis=1)
-    low, high = x.min(axis=0), x.max(axis=0)
-    scale = np.maximum((high - low) / 2.0, LEAST_SCALE)
-    terms = polynomial_terms((x - (low + high) / 2.0) / scale)
+    turn = quaternion_from_rotation(sections.rotation @ even.rotation.swapaxes(-1, -2))
+    gibbs = turn[..., 1:] / turn[..., :1]
+    changes = np.concatenate([sections.position_m - even.position_m, gibbs], axis=-1)
 
-    # Least squares, section by section
-    coefficient = []
-    for k in range(n_sections):
-        size = np.maximum(np.sqrt(np.mean(terms[:, k] ** 2, axis=0)), LEAST_SCALE)
-        of_section = terms[:, k] / size
-        square = of_section.T @ of_section / len(of_section) + RIDGE * np.eye(N_TERMS)
-        weights = np.linalg.solve(square, of_section.T @ changes[:, k] / len(of_section))
-        coefficient.append(weights / size[:, None])
-    return first._replace(
-        coefficient=np.array(coefficient), variable_centre=(low + high) / 2.0, variable_scale=scale
-    )
+    # A polynomial for each section
+    load_kg = np.asarray(pool.load_kg, float)[:, None]
+    fits = list[tuple[np.ndarray, np.ndarray, np.ndarray]]()
+    for k, moment in enumerate(first_moments(estimator, length, sections, load_kg)):
+        x = variables(length[:, k], bend[:, k], even.rotation[:, k], ups[:, k], moment, load_kg)
+        low, high = x.min(axis=0), x.max(axis=0)
+        centre, scale = (low + high) / 2.0, np.maximum((high - low) / 2.0, LEAST_SCALE)
+        terms = polynomial_terms((x - centre) / scale)  # (n, N_TERMS)
+        size = np.maximum(np.sqrt(np.mean(terms**2, axis=0)), LEAST_SCALE)
+        terms /= size
+        square = terms.T @ terms / len(terms) + RIDGE * np.eye(N_TERMS)
+        weights = np.linalg.solve(square, terms.T @ changes[:, k] / len(terms))
+        fits.append((weights / size[:, None], centre, scale))
+    coefficient, centre, scale = (np.stack(parts) for parts in zip(*fits, strict=True))
+    return estimator._replace(coefficient=coefficient, variable_centre=centre, variable_scale=scale)
+
+
+def _sections(spec: ArmSpec, q: Array) -> tuple[Frame, np.ndarray]:
+    """Return the ends of the sections (n, n_sections) of arms with joint coordinates (n, nv).
+
+    They are in the frames of the sections' starts. Beside them stand the directions against gravity
+    (n, n_sections, 3) in these frames.
+    """
+    frames = xla.jit(jax.vmap(chain_kinematics(ArmParams.from_spec(spec))))(q)
+    links = spec.structure.links_per_section
+    position_m = np.asarray(frames.plate_position, float)[:, ::links]
+    rotation = np.asarray(frames.plate_rotation, float)[:, ::links]
+    start = rotation[:, :-1].swapaxes(-1, -2)
+    moved_m = (start @ np.diff(position_m, axis=1)[..., None])[..., 0]
+    return Frame(moved_m, start @ rotation[:, 1:]), rotation[:, :-1, 2]
+
+
+def _first_estimator(spec: ArmSpec) -> PoseEstimator:
+    """Return the pose estimator of an arm whose sections bend evenly, in double precision."""
+    params, n_sections = ArmParams.from_spec(spec), spec.structure.n_sections
+    mount = params.mount
+    fields = {
+        "coefficient": np.zeros((n_sections, N_TERMS, N_CHANGES)),
+        "variable_centre": np.zeros((n_sections, N_VARIABLES)),
+        "variable_scale": np.ones((n_sections, N_VARIABLES)),
+        "spring_site_m": params.spring_site_m,
+        "section_mass_kg": np.reshape(params.link_mass_kg, (n_sections, -1)).sum(axis=1),
+        "gripper_mass_kg": params.tool_mass_kg[0],
+        "tool_offset_m": params.tool_offset_m,
+        "base_position_m": mount.base_position_m,
+        "base_rotation": mount.base_rotation,
+        "tip_offset_m": mount.tip_offset_m,
+        "tip_rotation": mount.tip_rotation,
+    }
+    return PoseEstimator(**{name: np.asarray(value, float) for name, value in fields.items()})
 
 
 def loaded_poses(arm: CalibratedArm, n: int, seed: int) -> LoadedPool:

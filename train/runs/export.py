@@ -256,15 +256,6 @@ def _more_entries(value: float, spec: ArmSpec, observation: Observation) -> np.n
 def contents(policy: Policy) -> list[str]:
     """Return lines that say what a policy's file holds."""
     errors = policy.provenance.get("estimator_errors", {})
-    worst_mm = max((error["p95"] for error in errors.get("tip_mm", {}).values()), default=0.0)
-    exact = (
-        []
-        if worst_mm <= POSE_ERROR_MM
-        else [
-            f"warning: 95 % of the estimated poses are within {worst_mm:.2g} mm of the simulation, expected "
-            f"{POSE_ERROR_MM:g} mm; the arm may be about to buckle at the limits of its pressures"
-        ]
-    )
     medians = [
         f"{what} {next(iter(errors[name].values()))['median']:.2g} {unit}"  # without payload
         for what, name, unit in (
@@ -276,10 +267,18 @@ def contents(policy: Policy) -> list[str]:
     ]
     observed = "pose and goal" + ("" if policy.observation == "pose" else f", {policy.observation}")
     correction = "none" if policy.s2r is None else f"left error about {float(policy.s2r.error_mm):.2g} mm"
-    return [
+    lines = [
         f"actor of {observed}: {_widths([weight for weight, _ in policy.layers])}, {policy.activation}",
         f"estimators of pose, payload and springs; median errors: {', '.join(medians) or 'not known'}",
-        *exact,
+    ]
+    worst_mm = max((error["p95"] for error in errors.get("tip_mm", {}).values()), default=0.0)
+    if worst_mm > POSE_ERROR_MM:
+        lines.append(
+            f"warning: 95 % of the estimated poses are within {worst_mm:.2g} mm of the simulation, expected "
+            f"{POSE_ERROR_MM:g} mm; the arm may be about to buckle at the limits of its pressures"
+        )
+    return [
+        *lines,
         f"correction of simulated poses: {correction}",
         f"{len(policy.workspace):,} poses of the workspace; the arm, its sensors and its control law",
     ]

@@ -72,7 +72,7 @@ def _evaluations(
         if all(f"evaluation/{name}" in row for row in evaluated):
             values = [factor * row[f"evaluation/{name}"] for row in evaluated]
             axes.plot(steps, values, "o-", markersize=3, color=colour, label=label)
-    axes.legend(frameon=False, loc="upper right")
+    axes.legend(frameon=False)
 
 
 def learning_curve(rows: list[dict[str, Any]]) -> Figure:

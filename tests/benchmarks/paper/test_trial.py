@@ -21,14 +21,14 @@ PIPE = Trial("pipe", 0, 0, "as shown")
 
 
 class Rod(LinearArm):
-    """An arm whose tip is always seen in one place; as a rod it does not say where its tip truly is."""
+    """An arm whose tip is always seen in one place. It does not say where its tip truly is."""
 
     def motion_capture(self):
         return Capture(np.zeros(3), DOWN, np.zeros((0, 3)))
 
 
 class Still(Rod):
-    """The same arm, with a gripper."""
+    """An arm whose tip is always seen in one place, and is there."""
 
     def tip(self):
         return np.zeros(3), np.eye(3)
