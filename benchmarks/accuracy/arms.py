@@ -1,23 +1,32 @@
 """Arms of several kinds: recorded and calibrated, trained, measured.
 
-Each is a rod twin with seed 0, or one whose rod is SoRoMoX's. The commands are those of `docs/your-arm.md`.
-Each arm is measured around a circle and at a grid of goals over its workspace. With `--loads` it follows the
-circle with payloads, too, which the loop does not know. The same command goes on where it ended.
+Each is a rod twin, a twin, or one whose rod is SoRoMoX's. The commands are those of `docs/your-arm.md`. Each
+arm is measured around a circle, and by default at a grid of goals over its workspace. With `--loads` it
+follows the circle with payloads, too, which the loop does not know. With several numbers of poses a picture
+shows the errors over the minutes of recording. The same command goes on where it ended.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from benchmarks.harness.common import names_of, target
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.harness.common import RESULTS, Row, grouped, names_of, target
 from benchmarks.harness.peers import peer_python
 from benchmarks.harness.stages import EVALUATION_FILE, WorkStage, claim, command, run_stages, train
+from calib.read.logs import read_log
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import scaled
 from mjx_softarm.spec import ArmSpec
+from train.runs.plots import BLUE, DPI, GREY, INK, ORANGE, dress
 
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
 
@@ -40,7 +49,7 @@ class Kind(NamedTuple):
     name: str  # as for `--spec`
     turn_deg: tuple[float, float, float] = HANGS  # of its base
     mass_share: float = 1.0
-    driver: str = ""  # for `--arm`; "": a rod twin
+    driver: str = "twin:rod:{seed}@{file}"  # for `--arm`
     peer: str = ""  # library of `benchmarks.harness.peers` in whose environment the driver runs
 
 
@@ -50,67 +59,99 @@ ARMS = {
     "stiff-flop": Kind("stiff-flop"),
     "four-chamber": Kind("four-chamber"),
     "upright": Kind("paper", STANDS, 0.1),
+    "twin": Kind("paper", driver="twin:{seed}@{file}"),
     "soromox": Kind("paper", driver="benchmarks.accuracy.soromox_arm:Arm", peer="soromox"),
 }
+
+KINDS = tuple(name for name in ARMS if name not in ("twin", "soromox"))  # unless others are asked for
+TITLES = {"twin": "twins", "paper": "rods, of other physics"}
+GOALS = "circle", "grid"
+RECORDING = "poses.npz"
+
+
+class Case(NamedTuple):
+    """One arm with one recording."""
+
+    arm: str  # name in ARMS
+    seed: int  # of the stand-in
+    poses: int  # number of random poses asked for
+
+    @property
+    def folder(self) -> str:
+        return f"{self.arm}-{self.seed}-{self.poses}-poses"
 
 
 class ArmSettings(NamedTuple):
     """Size of the measurement."""
 
-    poses: int
     preset: str
     steps: int | None
     points: int
+    goals: tuple[str, ...]
     loads: tuple[int, ...]
 
     @property
-    def goals(self) -> dict[str, tuple[str, int]]:
+    def measurements(self) -> dict[str, tuple[str, int]]:
         """Goals and payload [g] of each measurement, by its title."""
         loaded = {f"circle, {load_g} g": ("circle", load_g) for load_g in self.loads}
-        return {"circle": ("circle", 0), "grid": ("grid", 0), **loaded}
+        return {**{goals: (goals, 0) for goals in self.goals}, **loaded}
 
 
 def measure(
-    arms: Annotated[tuple[str, ...], names_of(ARMS)] = tuple(name for name in ARMS if not ARMS[name].peer),
-    poses: int = 300,
+    arms: Annotated[tuple[str, ...], names_of(ARMS)] = KINDS,
+    seeds: cli.Integers = (0,),
+    poses: cli.Integers = (300,),
     preset: str = "analytic",
     steps: int | None = None,
     points: int = 40,
+    goals: Annotated[tuple[str, ...], names_of(GOALS)] = GOALS,
     loads: cli.Integers = (),
     keep: Path = Path("runs/arms"),
 ) -> dict[str, Any]:
     """How well do arms of several kinds follow goals, from recording to measurement, by the same commands?
 
     Args:
-        arms: names of arms; all but soromox, which needs SoRoMoX's environment, unless given
-        poses: random poses of each calibration
+        arms: names of arms; twin and paper are stand-ins for the same one, of other physics; soromox needs
+            SoRoMoX's environment
+        seeds: of the stand-ins
+        poses: random poses of each recording, which ends earlier where more bring nothing
         preset: of each training
         steps: environment steps of each training; None: the preset's
         points: goals of the circle, and of the grid at most
+        goals: circle, or circle and grid
         loads: payloads with which the circle is followed, too [g]
-        keep: working folder: the same command continues, and arms may be added
+        keep: working folder: the same command continues, and arms, seeds and poses may be added
 
     Raises:
         InputError: a command failed, the folder has other settings, or SoRoMoX could not be installed.
     """
-    settings, out = ArmSettings(poses, preset, steps, points, loads), keep.absolute()
+    if "circle" not in goals:
+        raise InputError(f"--goals: got {','.join(goals)}, expected circle among them")
+    settings, out = ArmSettings(preset, steps, points, goals, loads), keep.absolute()
     claim(out, settings._asdict())
-    made = {arm: tuple(str(accuracy_file(Path(arm), title)) for title in settings.goals) for arm in arms}
-    run_stages(out, settings, [[WorkStage(arm, made[arm], take, (arm,)) for arm in arms]])
-    figures = {arm: figures_of(out / arm, settings) for arm in arms}
-    return {"targets": [_target(arm, row) for arm, row in figures.items()], **figures}
+    cases = [Case(*case) for case in itertools.product(arms, seeds, poses)]
+    made = {
+        case: tuple(str(accuracy_file(Path(case.folder), title)) for title in settings.measurements)
+        for case in cases
+    }
+    run_stages(out, settings, [[WorkStage(case.folder, made[case], take, (case,)) for case in cases]])
+    rows = [figures_of(out, settings, case) for case in cases]
+    if len(poses) > 1:
+        figure = minutes_figure(rows)
+        figure.savefig(RESULTS / "arms-minutes.png", dpi=DPI)
+    return {"targets": [_target(row) for row in rows], "arms": rows}
 
 
-def take(out: Path, settings: ArmSettings, arm: str) -> None:
+def take(out: Path, settings: ArmSettings, case: Case) -> None:
     """Take an arm through all commands, leaving out those whose results are there."""
     # The arm, and its stand-in
-    kind, folder = ARMS[arm], out / arm
+    kind, folder = ARMS[case.arm], out / case.folder
     file, calibration, run = folder / "arm.toml", folder / "calibration", folder / "run"
     spec = ArmSpec.of(Path(kind.name))
     masses = {part: scaled(getattr(spec.mass, part), kind.mass_share) for part in ("arm_kg", "gripper_kg")}
     folder.mkdir(parents=True, exist_ok=True)
     spec.replace(mass=masses, mounting={"base_turn_deg": kind.turn_deg}).to_toml(file)
-    stand_in = "--arm", kind.driver or f"twin:rod:0@{file}"
+    stand_in = "--arm", kind.driver.format(seed=case.seed, file=file)
     python = peer_python(kind.peer) if kind.peer else sys.executable
 
     def ensure(made: Path, *words: Any, python: Path | str = sys.executable) -> None:
@@ -119,8 +160,8 @@ def take(out: Path, settings: ArmSettings, arm: str) -> None:
             command(folder / "commands.log", *words, makes=made, python=python)
 
     # Record, calibrate, train and export
-    log = folder / "poses.npz"
-    record = ("mjx_softarm.deploy", "record", *stand_in, "--spec", file, "--poses", settings.poses)
+    log = folder / RECORDING
+    record = ("mjx_softarm.deploy", "record", *stand_in, "--spec", file, "--poses", case.poses)
     ensure(log, *record, "--out", log, python=python)
     ensure(calibration / "report.json", "calib", "run", log, "--spec", file, "--out", calibration)
     steps = ("--learner.total-env-steps", settings.steps) if settings.steps else ()
@@ -130,7 +171,7 @@ def take(out: Path, settings: ArmSettings, arm: str) -> None:
 
     # Measure the policy on its arm
     asked = ("mjx_softarm.deploy", "measure", run / "policy.npz", *stand_in, "--points", settings.points)
-    for title, (goals, load_g) in settings.goals.items():
+    for title, (goals, load_g) in settings.measurements.items():
         made = accuracy_file(folder, title)
         options = ("--goals", goals, *(("--payload", load_g) if load_g else ()), "--out", made.parent)
         ensure(made, *asked, *options, python=python)
@@ -141,10 +182,14 @@ def accuracy_file(folder: Path, title: str) -> Path:
     return folder / title.replace(", ", "-").replace(" ", "") / "accuracy.json"
 
 
-def figures_of(folder: Path, settings: ArmSettings) -> dict[str, Any]:
-    """Return the figures of an arm's measurements."""
-    figures = {"length [mm]": 1e3 * ArmSpec.from_toml(folder / "arm.toml").length_m}
-    for title, (_, load_g) in settings.goals.items():
+def figures_of(out: Path, settings: ArmSettings, case: Case) -> dict[str, Any]:
+    """Return the figures of an arm's recording and measurements."""
+    folder = out / case.folder
+    spec = ArmSpec.from_toml(folder / "arm.toml")
+    time_s = read_log(folder / RECORDING, spec)[0].time_s
+    figures: dict[str, Any] = {"arm": case.arm, "seed": case.seed, "poses": case.poses}
+    figures |= {"recording [min]": float(np.ptp(time_s)) / 60, "length [mm]": 1e3 * spec.length_m}
+    for title, (_, load_g) in settings.measurements.items():
         accuracy = json.loads(accuracy_file(folder, title).read_text("utf-8"))
         figures |= {f"{title}, {name}": accuracy[key] for name, key in FIGURES.items()}
         if load_g:
@@ -152,12 +197,30 @@ def figures_of(folder: Path, settings: ArmSettings) -> dict[str, Any]:
     return figures
 
 
-def _target(arm: str, row: dict[str, Any]) -> dict[str, str]:
+def minutes_figure(rows: Sequence[Row]) -> Figure:
+    """Draw the mean error on the circle over the minutes of recording, a line for each stand-in."""
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    panel = figure.subplots()
+    dress(panel, "circle, one line for each stand-in", "recording [min]", "tip error [mm]")
+    colours = dict(zip(dict.fromkeys(row["arm"] for row in rows), (BLUE, ORANGE, INK, GREY), strict=False))
+    for (arm, _), group in grouped(rows, ("arm", "seed")).items():
+        line = [[row["recording [min]"], row["circle, mean [mm]"]] for row in group]
+        x, y = np.array(sorted(line)).T
+        panel.plot(x, y, "o-", color=colours[arm], markersize=4.0, label=TITLES.get(arm, arm))
+    panel.set_ylim(bottom=0.0)
+    handles, labels = panel.get_legend_handles_labels()
+    legend = dict(zip(labels, handles, strict=True))  # each once
+    panel.legend(legend.values(), legend.keys(), frameon=False)
+    return figure
+
+
+def _target(row: Row) -> dict[str, str]:
     length_mm = row["length [mm]"]
     share = row["circle, mean [mm]"] / length_mm
     n_refused = row["circle, goals"] - row["circle, measured"]
     return target(
-        f"{arm}: circle within {WITHIN:.1%} of {length_mm:g} mm, no goal refused",
+        f"{row['arm']} {row['seed']}, {row['poses']} poses: "
+        f"circle within {WITHIN:.1%} of {length_mm:g} mm, no goal refused",
         f"{share:.2%} in the mean, {n_refused} of {row['circle, goals']} goals refused",
         share <= WITHIN and not n_refused,
     )

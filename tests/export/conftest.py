@@ -70,6 +70,9 @@ def carrying_policy(spec=SPEC):
     return dataclasses.replace(busy_policy(spec), **changes)
 
 
+N_SINGLE = 200  # single rows of the fixture `golden`, a fifth of an export's
+
+
 @contextlib.contextmanager
 def few_golden_rows(run_ticks=30):
     """Golden rows made in here are few; runs end after so many ticks."""
@@ -95,4 +98,9 @@ def controller(policy_file):
 
 @pytest.fixture(scope="session")
 def golden(controller, policy_file):
-    return golden_rows.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())
+    """Rows of all kinds; the runs are as long as an export's."""
+    few = {"N_SINGLE": N_SINGLE, "N_CHECKED": 24, "_CANDIDATES": 120}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, number in few.items():
+            patch.setattr(golden_rows, name, number)
+        return golden_rows.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())

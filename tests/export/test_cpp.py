@@ -102,7 +102,7 @@ def test_a_tick_neither_allocates_nor_throws(folder):
         "  if (!softarm::reaches(goal, pose)) c.vent(softarm::ARM_LOST);\n"
         "  return c.set_goal(goal) && c.tip(pose) && c.tick(readings).vented;\n}\n"
     )
-    compile_("-O2", "-fno-exceptions", "-fno-rtti", "-c", folder / "tick.cpp", "-o", folder / "tick.o")
+    compile_("-O1", "-fno-exceptions", "-fno-rtti", "-c", folder / "tick.cpp", "-o", folder / "tick.o")
     listed = subprocess.run(["nm", "-u", folder / "tick.o"], capture_output=True, text=True, check=True)
     called = {line.split()[-1] for line in listed.stdout.splitlines()}
     assert "tanhf" in called and "acos" in called
@@ -176,6 +176,7 @@ def test_cmake_builds_both_programs(folder, tmp_path):
 
 
 def test_other_programs_and_rows_are_refused(folder, golden, tmp_path):
+    golden = golden._replace(inputs=golden.inputs[:3], outputs=golden.outputs[:3])
     other = golden._replace(about=golden.about | {"policy_sha256": "0" * 64})
     with pytest.raises(InputError, match="rows: got policy [0-9a-f]{12}, expected 000000000000"):
         check(other, folder / "rows")

@@ -11,10 +11,10 @@ from mjx_softarm.export import computations
 from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.__main__ import main
 from mjx_softarm.export.check import TOLERANCE, check, compare, without_memory
-from mjx_softarm.export.golden import BITS, FLAGS, N_SINGLE, read_golden, write_golden
+from mjx_softarm.export.golden import BITS, FLAGS, read_golden, write_golden
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.runtime import InMotion
-from tests.export.conftest import few_golden_rows
+from tests.export.conftest import N_SINGLE, few_golden_rows
 from tests.linear_arm import N
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")

@@ -11,12 +11,12 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.loop import start, step, with_goal
 from mjx_softarm.export import computations
 from mjx_softarm.export.check import TOLERANCE, check
-from mjx_softarm.export.golden import FLAGS, N_SINGLE, read_golden
+from mjx_softarm.export.golden import FLAGS, read_golden
 from mjx_softarm.export.write import export_onnx
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.policy.runtime import PolicyRunner, actor_output
 from tests.arms import SIX_CHAMBERS, TAPERED
-from tests.export.conftest import carrying_policy, draw_wire_policy, few_golden_rows, moving_policy
+from tests.export.conftest import N_SINGLE, carrying_policy, draw_wire_policy, few_golden_rows, moving_policy
 from tests.linear_arm import N
 
 onnx = pytest.importorskip("onnx", reason="the package onnx is not installed")
