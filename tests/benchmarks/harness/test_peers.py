@@ -1,10 +1,12 @@
 """Virtual environments of peers, without making one: what marks them complete."""
 
+import re
 import subprocess
 from importlib import metadata
 from unittest.mock import Mock
 
 import pytest
+from packaging.requirements import Requirement
 
 from benchmarks.harness import peers
 from benchmarks.harness.peers import MARKER, PINS, SHARED, peer_packages, peer_python
@@ -24,6 +26,15 @@ def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here
     requirements = dict(pin.replace("[cuda12]", "").split("==") for pin in peer_packages(name))
     pins = dict(pin.split("==") for pin in PINS[name])
     assert requirements == pins | {shared: metadata.version(shared) for shared in SHARED}
+
+
+def test_the_simulator_s_packages_are_shared():
+    """A peer trains on this project's environment."""
+    required = [Requirement(text) for text in metadata.requires("mjx-softarm") or ()]
+    needed = {one.name for one in required if not one.marker or one.marker.evaluate({"extra": "sim"})}
+    assert "brax" in needed and {re.sub("[-_.]+", "-", name) for name in needed} <= {
+        re.sub("[-_.]+", "-", name) for name in SHARED
+    }
 
 
 def test_an_environment_is_made_once_and_anew_for_a_changed_pin_or_python(install, monkeypatch, tmp_path):
