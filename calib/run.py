@@ -7,7 +7,6 @@ The result is a folder that training takes:
     pressures.npz residual pressures that hold the arm, if there were poses to fit them to
     report.html   results with pictures, and whether to trust them
     report.json   the same for programs
-    poses.npz     measured and simulated poses that the network was fitted to, for the view
 """
 
 from __future__ import annotations
@@ -24,18 +23,16 @@ from calib.read.static_poses import SAME_KG
 from calib.report.page import Section, to_html, to_json
 from calib.steps import STEPS, Step, changes, payloads
 from mjx_softarm._support.provenance import write_json
-from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated arm, the sections of the report, and the poses that the view shows."""
+    """Calibrated arm, and the sections of the report."""
 
     arm: CalibratedArm
     sections: tuple[Section, ...]
-    pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
 
 
 def calibrate(
@@ -64,7 +61,7 @@ def calibrate(
     if 0 < len(later) < len(logs):
         first = calibrate([log for log in logs if log.goal is None], spec, seed, steps, progress)
         return go_on(first, later, seed, progress)
-    start = Calibration(CalibratedArm(spec), (), {})
+    start = Calibration(CalibratedArm(spec), ())
     return _run_steps(start, steps, measure(logs, spec), seed, progress)
 
 
@@ -100,9 +97,7 @@ def _run_steps(
     for name, step in steps.items():
         progress(f"{name} ...")
         result = step(measurements, calibration.arm, seed)
-        calibration = Calibration(
-            result.arm, (*calibration.sections, result.section), result.pairs or calibration.pairs
-        )
+        calibration = Calibration(result.arm, (*calibration.sections, result.section))
     return calibration
 
 
@@ -112,8 +107,7 @@ def load_calibration(folder: Path) -> Calibration:
     Raises:
         InputError: a file is missing, damaged, or of another arm.
     """
-    pairs = read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {}
-    return Calibration(CalibratedArm.read(folder), (), pairs)
+    return Calibration(CalibratedArm.read(folder), ())
 
 
 def refuse_existing(folder: Path) -> None:
@@ -149,8 +143,6 @@ def write_calibration(
         part.mkdir(parents=True)
         calibration.arm.spec.to_toml(part / ARM_FILE)
         calibration.arm.write_models(part)
-        if calibration.pairs:
-            write_pose_pairs(part, calibration.pairs)
         report = (calibration.sections, findings, provenance)
         write_json(part / "report.json", to_json(*report))
         (part / "report.html").write_text(to_html(calibration.arm.spec.name, *report), "utf-8")

@@ -36,12 +36,10 @@ from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
 from calib.report import sections
 from calib.report.page import Section
-from mjx_softarm.logs.pose_pairs import PosePairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.sensing.held_pressures import residual
 from mjx_softarm.sensing.load import KNOWN
 from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import correct, extrapolation
 from mjx_softarm.spec import ArmSpec, Unmodelled
 
 # Least number of poses of a network. From 49 poses of a rod it brought held-out tips from 10.4 to 2.6 mm.
@@ -54,7 +52,6 @@ class StepResult(NamedTuple):
 
     arm: CalibratedArm  # with the numbers and models that the step fitted
     section: Section  # section of the report
-    pairs: Mapping[str, PosePairs] | None = None  # measured and simulated poses, without and with the network
 
 
 Step = Callable[[Measurements, CalibratedArm, int], StepResult]
@@ -172,24 +169,19 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     others = (fit,) if printed else ()
     fit = fit_s2r(spec, settled, real, seed, printed=True) if printed else fit
     section = sections.s2r(fit, settled.pose, settled.spring_m, real, n_unsettled, others)
-    corrected, away = (f(fit.s2r, settled.pose, settled.spring_m) for f in (correct, extrapolation))
-    pairs = {
-        "simulated": PosePairs(real, settled.pose, np.zeros(len(real), bool)),
-        "with the network": PosePairs(real, corrected, away > 1.0),
-    }
     # Fit the pressures that hold the arm.
     held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[rows], settled.pressure_kpa, seed)
     if fit.is_better:
         arm = arm._replace(s2r=fit.s2r)
     if not held.is_better:
-        return StepResult(arm, section, pairs)
+        return StepResult(arm, section)
     spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
     arm = arm._replace(spec=spec, held=held.held)
     largest_kg = spec.mass.largest_payload_kg
     unloaded = payload_poses(arm._replace(held=None))
     widths_kg = payload_intervals(held.held, unloaded, largest_kg)
     section = sections.with_pressures(section, held, widths_kg, KNOWN * largest_kg)
-    return StepResult(arm, section, pairs)
+    return StepResult(arm, section)
 
 
 class _SettledPoses(NamedTuple):

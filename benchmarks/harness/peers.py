@@ -28,7 +28,7 @@ PINS = {
     "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3),
     "soromox": ("soromox==0.5.0", "diffrax==0.7.2", "equinox==0.13.8"),
 }
-# Packages of mjx_softarm, of its extra `sim`, and what train.runs.evaluate and train.epoch.job import beside them.
+# Packages of mjx_softarm and of its extra `sim`, and those that evaluation and `train.epoch.job` import, too.
 SHARED = (
     *("numpy", "tomli_w", "tyro"),
     *("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "gymnasium", "matplotlib", "pillow", "scipy"),

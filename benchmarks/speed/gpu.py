@@ -30,7 +30,6 @@ STEPS = {
     ("mjx", "quasistatic"): (1024, 8192),
     ("mjx", "dynamic"): (1024, 8192, 65_536),
     ("mjx-step", "dynamic"): (1024, 8192, 65_536),
-    ("warp", "dynamic"): (1024, 8192, 65_536),
 }
 # Presets, their seeds, and options that suit a GPU: more arms, larger batches and a larger pool of goals
 TRAININGS = {

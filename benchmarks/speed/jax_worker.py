@@ -57,7 +57,7 @@ def mesh_of_cores(n_arms: int) -> Mesh | None:
     """
     _make_devices()
     n = max(n for n in range(1, n_cores() + 1) if n_arms % n == 0)
-    return mesh_of(str(n)) if jax.default_backend() == "cpu" else None
+    return mesh_of(n) if jax.default_backend() == "cpu" else None
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Modules that are imported when they are first used, so that commands without them begin quickly.
 
 MuJoCo and MJX take more than a second, and calibration seldom needs them. `mujoco.mjx`, which brax imports,
-prints two lines at import if warp is not installed. Only the engine "warp" needs it, so these lines are held
+prints two lines at import if warp is not installed. Nothing here needs it, so these lines are held
 back. MJX has not enough types to be checked.
 """
 
@@ -16,8 +16,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import jax
-
-from mjx_softarm._support.errors import InputError
 
 __all__ = ["LazyModule", "brax_envs", "mjx", "mujoco", "put"]
 
@@ -70,21 +68,11 @@ else:
     brax_envs = LazyModule("brax.envs", _import_quietly)
 
 
-def put(model: mujoco.MjModel, warp: bool = False) -> tuple[mjx.Model, mjx.Data]:
-    """Return a compiled model and its data on the device, for MJX in JAX or for MJX-Warp.
+def put(model: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
+    """Return a compiled model and its data on the device.
 
     The actuators take any pressure: a closed chamber that is pressed together exceeds the limits of commands.
-
-    Raises:
-        InputError: MJX-Warp without a GPU or without warp-lang.
     """
     model = copy.copy(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-    if not warp:
-        return mjx.put_model(model), mjx.make_data(model)
-    if jax.default_backend() != "gpu":
-        raise InputError(f"engine 'warp': got a {jax.default_backend()}, expected a GPU")
-    try:
-        return mjx.put_model(model, impl="warp"), mjx.make_data(model, impl="warp")
-    except RuntimeError as error:
-        raise InputError(f"engine 'warp': got {error!r}, expected `pip install warp-lang`") from error
+    return mjx.put_model(model), mjx.make_data(model)

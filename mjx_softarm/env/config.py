@@ -16,8 +16,8 @@ from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.spec import ArmSpec
 
-Engine = Literal["mjx", "chain", "mjx-step", "warp"]
-ENGINES = {"quasistatic": ("mjx", "chain"), "dynamic": ("mjx", "mjx-step", "warp")}  # by mode
+Engine = Literal["mjx", "chain", "mjx-step"]
+ENGINES = {"quasistatic": ("mjx", "chain"), "dynamic": ("mjx", "mjx-step")}  # by mode
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class EnvConfig:
 
     engine: Annotated[Engine, arg(aliases=["--engine"])] = "mjx"
     """at rest, MJX's kinematics, tendons and forces at equilibria that the closed form proposes (mjx), or the
-    closed form alone (chain); in motion, MJX's inertia in this project's own time step (mjx), `mjx.step` of
-    the compiled model (mjx-step), or the same by MJX-Warp, which needs a GPU and warp-lang (warp)"""
+    closed form alone (chain); in motion, MJX's inertia in this project's own time step (mjx), or `mjx.step`
+    of the compiled model (mjx-step)"""
     mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
     """an action leads to its equilibrium, or moves the arm for a while"""
     links_per_section: int | None = None
@@ -145,11 +145,8 @@ class EnvConfig:
         required["axes"] = usable, "six finite numbers >= 0, some more than 0"
         check_settings("RewardConfig", self.reward, required)
 
-        # Settings of MJX-Warp and of the pipe
+        # Settings of the pipe
         piped = self.pipe_diameter_mm is not None
-        no_friction = self.engine != "warp" or not self.randomisation.friction_max_n
-        required = {"friction_max_n": (no_friction, "0 with the engine 'warp'")}
-        check_settings("Randomisation", self.randomisation, required)
         no_cost = piped or not self.clearance_cost_per_mm
         required = {"clearance_cost_per_mm": (no_cost, "0.0 without a pipe_diameter_mm")}
         check_settings("EnvConfig", self, required)

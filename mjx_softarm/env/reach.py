@@ -151,8 +151,8 @@ class ReachEnv(brax_envs.Env):
 
         # Simulation, and the poses that starts and goals are drawn from
         self.uses_mjx = self.config.engine != "chain"
-        warp, self.n_at_once = self.config.engine == "warp", arms_at_once(self.spec.n_links)
-        self.model, self._data = put(build_model(self.spec), warp) if self.uses_mjx else (None, None)
+        self.n_at_once = arms_at_once(self.spec.n_links)
+        self.model, self._data = put(build_model(self.spec)) if self.uses_mjx else (None, None)
         self._results = MotionResult if self.config.moves else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
         self.poses = PosePool(self.spec, self.config, self._observed_pose)

@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.logs import mcap_file
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.checks import Finding, LogError
-from mjx_softarm.logs.schema import ENDINGS, GROUPS, UNITS, Column, Log, log_columns
+from mjx_softarm.logs.schema import GROUPS, TABLES, UNITS, Column, Log, log_columns
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.sensing.sensors import SENSORS
 from mjx_softarm.spec import ArmSpec
@@ -156,7 +155,7 @@ def _absent(
         yield "", f"got only {', '.join(names)[:60]}, expected {', '.join(most)} or {last}"
 
 
-def check_file(option: str, path: Path | None, endings: Sequence[str] = ENDINGS) -> None:
+def check_file(option: str, path: Path | None, endings: Sequence[str] = TABLES) -> None:
     """Refuse a file that could not be written, or whose ending names another format, before the arm moves."""
     if path is not None and path.suffix and path.suffix not in endings:
         raise InputError(f"{option}: got {path}, expected a name that ends in {' or '.join(endings)}")
@@ -164,6 +163,3 @@ def check_file(option: str, path: Path | None, endings: Sequence[str] = ENDINGS)
         raise InputError(f"{option}: got {path}, expected a file in a folder that exists")
     if path is not None and path.is_dir():
         raise InputError(f"{option}: got {path}, a folder, expected a file")
-    if path is not None and path.suffix == mcap_file.SUFFIX:
-        with needing("mcap", option):
-            import mcap  # noqa: F401

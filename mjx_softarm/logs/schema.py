@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 
 from mjx_softarm._support.files import replacing
-from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.sensing.sensors import SENSORS, Coil, Sensor
 
@@ -34,8 +33,7 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
         **{sensor.reading_name: sensor.units for sensor in SENSORS.values()},
     }
 )
-TABLES = (".csv", ".npz")  # endings of the logs that this project reads
-ENDINGS = (*TABLES, mcap_file.SUFFIX)  # endings of the logs that it writes
+TABLES = (".csv", ".npz")  # endings of logs
 _XYZ = ("x", "y", "z")
 _POSE = dict.fromkeys(_XYZ, ("pose_length", "mm")) | dict.fromkeys(("yaw", "pitch", "roll"), ("angle", "deg"))
 
@@ -145,7 +143,7 @@ def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
 
 
 def write_log(path: str | Path, log: Log) -> None:
-    """Write a log as CSV, or as npz or MCAP by the suffix of the name; whole or not at all.
+    """Write a log as CSV, or as npz by the suffix of the name; whole or not at all.
 
     Raises:
         OSError: the file cannot be written.
@@ -156,7 +154,5 @@ def write_log(path: str | Path, log: Log) -> None:
     with replacing(path) as part, part.open("wb") as file:
         if path.suffix == ".npz":
             np.savez(file, columns=np.array(headers), table=table)
-        elif path.suffix == mcap_file.SUFFIX:
-            mcap_file.write_mcap(file, [(c.group, c.name, c.unit) for c in columns], table)
         else:
             np.savetxt(file, table, "%.9g", ",", header=",".join(headers), comments="")

@@ -22,7 +22,6 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import check_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.logs.files import check_file
-from mjx_softarm.logs.schema import TABLES
 from mjx_softarm.policy.file import SHIPPED, SHIPPED_TWIN, load_policy
 from mjx_softarm.spec import ArmSpec
 
@@ -80,10 +79,10 @@ def _view(
     html: cli.MaybePath = None,
     at: Annotated[Address, tyro.conf.arg(name="")] = Address(),
 ) -> int:
-    """Show an arm in the browser and steer it there; or replay logs; or follow a run, or show a calibration.
+    """Show an arm in the browser and steer it there, or replay logs.
 
     Args:
-        logs: logs of `deploy run` and `record`, CSV or npz, side by side; or a run's or calibration's folder
+        logs: logs of `deploy run` and `record`, CSV or npz, side by side
         log: file for the log of the steered run, CSV or npz
         demos: file for demonstrations, poses taken on the page for `train imitate`, CSV or npz
         html: file to write the logs to, as a page that plays without a server
@@ -92,11 +91,8 @@ def _view(
     with needing("view", "view"):
         import viser  # noqa: F401
     check_file("--log", log)
-    check_file("--demos", demos, TABLES)
+    check_file("--demos", demos)
     check_file("--html", html, (".html", ".htm"))
-    # Show a folder's errors, or replay logs.
-    if any(path.is_dir() for path in logs):
-        return _errors(logs, html, at)
     if logs:
         return _replay(logs, ArmSpec.of(spec), html, at)
     if html is not None:
@@ -125,16 +121,6 @@ def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Addres
         tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
         return 0
     return replay(_served(at, ", ".join(timeline.name for timeline in timelines)), spec, timelines)
-
-
-def _errors(folders: tuple[Path, ...], html: Path | None, at: Address) -> int:
-    from mjx_softarm.view.errors import follow_errors, spec_of
-
-    folder, *others = folders
-    if others or html is not None:
-        raise InputError(f"LOGS: got {folder} and more, expected one folder without --html, or logs")
-    spec_of(folder)
-    return follow_errors(_served(at, folder.name), folder)
 
 
 def _served(at: Address, label: str) -> viser.ViserServer:

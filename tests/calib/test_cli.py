@@ -15,7 +15,6 @@ from calib.fit import s2r
 from calib.fit.payload import held_at
 from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
-from mjx_softarm.logs.pose_pairs import read_pose_pairs
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.sensing.s2r import load_s2r
 
@@ -47,16 +46,12 @@ def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
     assert status in (0, 1)
     names = [
         "arm.toml",
-        "poses.npz",
         "pressures.npz",
         "report.html",
         "report.json",
         "s2r.npz",
     ]
     assert sorted(p.name for p in folder.iterdir()) == names
-    pairs = read_pose_pairs(folder)
-    network, alone = pairs["with the network"], pairs["simulated"]
-    assert np.median(network.error_mm) < np.median(alone.error_mm) and len(network.target) >= 60
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
     report = json.loads((folder / "report.json").read_text())
     assert status == (0 if report["trustworthy"] else 1)

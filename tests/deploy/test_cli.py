@@ -111,9 +111,9 @@ def test_command_line_runs_without_jax(folder):
         ("run policy.npz --log no/a.csv", "--log: got no/a.csv, expected a file in a folder"),
         (
             "run policy.npz --log a.xlsx",
-            "--log: got a.xlsx, expected a name that ends in .csv or .npz or .mcap",
+            "--log: got a.xlsx, expected a name that ends in .csv or .npz",
         ),
-        ("record --out a.txt", "--out: got a.txt, expected a name that ends in .csv or .npz or .mcap"),
+        ("record --out a.txt", "--out: got a.txt, expected a name that ends in .csv or .npz"),
         ("record --out policy.npz", "--out: got policy.npz, which is there already, expected a new file"),
         ("measure policy.npz --out .", "--out: got ., which is there already, expected a new folder"),
         ("measure policy.npz --out new", "driver:Arm: got an arm without the method motion_capture"),

@@ -2,26 +2,18 @@
 
 import dataclasses
 import math
-from importlib.util import find_spec
 
 import pytest
 
-from mjx_softarm._support.errors import InputError
-from mjx_softarm._support.lazy import put
-from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.spec import ArmSpec
 
 REFUSED = [
     ({"engine": "mujoco"}, r"EnvConfig\.engine: got 'mujoco', expected one of"),
     ({"mode": "static"}, r"EnvConfig\.mode: got 'static', expected one of"),
     ({"observation": "motion"}, "got 'motion', expected 'pose' or 'payload' for arms at rest"),
-    ({"engine": "warp"}, "engine: got 'warp', expected one of .*'mjx', 'chain'"),
-    (
-        {"engine": "warp", "mode": "dynamic", "randomisation": Randomisation(friction_max_n=1.0)},
-        "friction_max_n: got 1.0, expected 0 with the engine 'warp'",
-    ),
+    ({"engine": "mjx-step"}, "engine: got 'mjx-step', expected one of .*'mjx', 'chain'"),
     ({"links_per_section": 0}, "links_per_section: got 0, expected at least 1"),
     ({"clearance_cost_per_mm": 1.0}, "clearance_cost_per_mm: got 1.0, expected 0.0 without a pipe"),
     ({"even_share": 1.1}, r"EnvConfig.even_share: got 1.1, expected 0 to 1"),
@@ -41,18 +33,6 @@ def test_a_number_that_is_negative_or_not_finite_is_refused_by_name(value):
         EnvConfig(reward=RewardConfig(threshold=value))
     with pytest.raises(ValueError, match=rf"\.payload_max_kg: got {value}, expected a finite number >"):
         Randomisation(payload_max_kg=value)
-
-
-def test_warp_needs_a_gpu(spec):
-    with pytest.raises(InputError, match="engine 'warp': got a cpu, expected a GPU"):
-        ReachEnv(spec, EnvConfig(engine="warp", mode="dynamic", n_poses=1))
-
-
-@pytest.mark.skipif(find_spec("warp") is not None, reason="warp-lang is installed")
-def test_warp_that_is_not_installed_is_told(spec, monkeypatch):
-    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    with pytest.raises(InputError, match=r"warp-lang is not installed.*expected `pip install warp-lang`"):
-        put(build_model(spec), warp=True)
 
 
 def test_the_simulated_arm_may_have_fewer_links_than_the_specified_one():

@@ -22,16 +22,13 @@ from mjx_softarm.env.config import ENGINES
 from train.agent.imitation import ImitationConfig
 from train.config import TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
-from train.epoch import devices
+from train.epoch.devices import mesh_of
 from train.options import NewRunOptions, ReachOptions, named, start
 from train.presets import IMITATION_PRESETS
 from train.runs import run as runs
 from train.runs.evaluate import N_ACTIONS
 from train.runs.folder import Run, sole_trainer
 from train.runs.task import Task, task_of
-
-Devices = Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="D", help=devices.HELP)]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Reach(ReachOptions):
@@ -40,11 +37,12 @@ class Reach(ReachOptions):
     agent: cli.MaybePath = None
     """run whose policy this one begins with: one of TQC, with its critics; for analytic any run. The widths
     of its hidden layers are taken, too"""
-    devices: Devices = None
+    devices: int = 1
+    """number of devices to spread arms, replay and batches over"""
 
     def __call__(self) -> int:
         console = start()
-        mesh = _mesh(self.devices, console)
+        mesh = mesh_of(self.devices)
         if self.resume:
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
@@ -68,7 +66,8 @@ class Imitate(NewRunOptions):
     """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""
     reward: cli.MaybePath = None
     """run whose learned reward this one uses without training it"""
-    devices: Devices = None
+    devices: int = 1
+    """number of devices to spread arms, replay and batches over"""
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
@@ -77,7 +76,7 @@ class Imitate(NewRunOptions):
 
     def __call__(self) -> int:
         console = start()
-        mesh = _mesh(self.devices, console)
+        mesh = mesh_of(self.devices)
         if self.resume:
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
@@ -151,13 +150,6 @@ def evaluate(
     write_json(file, summary.to_dict())
     console.print(f"written: {file}", highlight=False, soft_wrap=True)
     return 0
-
-
-def _mesh(text: str | None, console: Console) -> Mesh | None:
-    """Return the devices to train on; only the first process prints to the console."""
-    mesh = devices.mesh_of(text)
-    console.quiet = not devices.is_first_process()
-    return mesh
 
 
 def _begin(

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-from jax.experimental.multihost_utils import sync_global_devices
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
@@ -20,14 +19,12 @@ from mjx_softarm._support.files import read_json_lines, replacing
 from mjx_softarm._support.lazy import LazyModule
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.logs.files import LogError
-from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
 from train.agent.registry import learns_from_demonstrations
 from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
-from train.epoch.devices import is_first_process
 
 if TYPE_CHECKING:
     import orbax.checkpoint as ocp
@@ -136,7 +133,7 @@ def _is_damage(folder: Path, error: Exception) -> bool:
 
 
 def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
-    """Return shape, type and device of an array; by default this process's first device.
+    """Return shape, type and device of an array; by default the first device.
 
     Otherwise orbax restores to the devices of the saved array, which may not exist here.
     """
@@ -144,7 +141,7 @@ def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
     assert isinstance(shape, jax.ShapeDtypeStruct)  # a state has no plain numbers
     if shape.sharding is not None:
         return shape
-    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     return jax.ShapeDtypeStruct(shape.shape, shape.dtype, sharding=device)
 
 
@@ -153,11 +150,8 @@ class Run:
 
     `config.json` (settings, arm, preset, versions, commit), `s2r.npz` and `pressures.npz` (models of the
     arm's calibration, if it has them), `demonstrations.npz` (if it learns from them), `checkpoints/`,
-    `metrics.jsonl`, `poses.npz` (of the newest evaluation), `evaluation.json`, pictures, TensorBoard's event
-    files and, once exported, `policy.npz` and `estimators.npz`.
-
-    Several processes that train together share the folder. All of them open it and save checkpoints. The
-    first process alone writes all else.
+    `metrics.jsonl`, `evaluation.json`, pictures, TensorBoard's event files and, once exported, `policy.npz`
+    and `estimators.npz`.
     """
 
     def __init__(self, path: Path, config: TrainConfig, arm: CalibratedArm):
@@ -195,22 +189,19 @@ class Run:
         Raises:
             InputError: the folder already holds a run, or cannot be made.
         """
-        # Refuse a folder with a run. All processes look before the first one writes.
+        # Refuse a folder with a run.
         if (path / CONFIG_FILE).exists():
             raise InputError(
                 f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"
             )
-        sync_global_devices(f"{path} is free")
         run = cls(path, config, arm)
         try:
             # Write what a run begins with, over what a start that was interrupted has left.
-            if is_first_process():
-                path.mkdir(parents=True, exist_ok=True)
-                arm.write_models(path)
-                if demonstrations is not None:
-                    write_log(path / DEMONSTRATIONS_FILE, demonstrations)
-                shutil.rmtree(run.checkpoints.path, ignore_errors=True)
-            sync_global_devices(f"{path} is begun")
+            path.mkdir(parents=True, exist_ok=True)
+            arm.write_models(path)
+            if demonstrations is not None:
+                write_log(path / DEMONSTRATIONS_FILE, demonstrations)
+            shutil.rmtree(run.checkpoints.path, ignore_errors=True)
             if first is not None:
                 run.checkpoints.save(0, *first)
             # Write the config last: with it the folder is a run.
@@ -222,8 +213,7 @@ class Run:
                 "begins_with": {name: str(folder) for name, folder in (begins_with or {}).items()},
                 "provenance": provenance("train"),
             }
-            if is_first_process():
-                write_json(path / CONFIG_FILE, data)
+            write_json(path / CONFIG_FILE, data)
         except OSError as error:
             raise InputError(f"{path}: got {error.strerror!r}, expected to write a new folder") from error
         return run
@@ -291,31 +281,18 @@ class Run:
     def rewind(self, epoch: int) -> None:
         """Delete checkpoints and metrics later than an epoch, before the run continues from there."""
         self.checkpoints.rewind(epoch)
-        if not is_first_process():
-            return
         rows = [row for row in self.metrics() if row["epoch"] <= epoch]
         with replacing(self.path / METRICS_FILE) as part:
             part.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
 
     def log(self, row: dict[str, Any]) -> None:
         """Append a line to `metrics.jsonl`."""
-        if is_first_process():
-            with (self.path / METRICS_FILE).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
+        with (self.path / METRICS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
 
     def metrics(self) -> list[dict[str, Any]]:
         """Return the lines of `metrics.jsonl`, up to the first incomplete one."""
         return read_json_lines(self.path / METRICS_FILE)
-
-    def write_poses(self, *results: Any) -> None:
-        """Write poses at goals, and around the circle if they were evaluated, for the view."""
-        if is_first_process():
-            reached = [getattr(result, "reached", result) for result in results]
-            sets = {
-                name: PosePairs(at.goal, at.pose, (at.saturated_chambers > 0) | ~at.settled)
-                for name, at in zip(("goals", "circle"), reached, strict=False)
-            }
-            write_pose_pairs(self.path, sets)
 
     def evaluation(self) -> dict[str, Any] | None:
         """Return the figures in `evaluation.json`, None where the run is not finished."""
@@ -327,18 +304,14 @@ class Run:
 def sole_trainer(path: Path) -> Iterator[None]:
     """Lock a folder while training in it; a killed process releases the lock.
 
-    Where several processes train together, the first one holds it.
-
     Raises:
         InputError: another process holds it.
     """
-    with contextlib.ExitStack() as stack:
-        if is_first_process():
-            file = stack.enter_context(open(path / LOCK_FILE, "w"))
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise InputError(
-                    f"{path}: got another process that trains in it, expected none; stop it, or wait"
-                ) from error
+    with open(path / LOCK_FILE, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"{path}: got another process that trains in it, expected none; stop it, or wait"
+            ) from error
         yield

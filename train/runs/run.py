@@ -23,7 +23,6 @@ from mjx_softarm.env import ReachEnv
 from train.agent.learner import LearnerConfig
 from train.agent.registry import name_of
 from train.config import TrainConfig
-from train.epoch.devices import any_process, is_first_process
 from train.epoch.job import State
 from train.runs.folder import EVALUATION_FILE, Run
 from train.runs.task import Task, task_of
@@ -112,14 +111,14 @@ def train_together(
                 for k in range(len(members))
             ]
             epoch += 1
-            stop, due = any_process(bool(asked)), config.evaluates_after(epoch)
+            stop, due = bool(asked), config.evaluates_after(epoch)
             # Evaluate, record and save each member.
             for k, ((run, task), board, row) in enumerate(zip(members, boards, rows, strict=True)):
                 refuse_divergence(run.config, row["env/unsettled"])
                 member_state = member(state, k) if due or stop else None
                 if member_state is not None and due:
                     with noted(console, "compiling the evaluation ..."):
-                        row |= evaluation(run, task, learner.policy(member_state.learner))
+                        row |= evaluation(task, learner.policy(member_state.learner))
                 record(run, board, epoch, row)
                 if member_state is not None:
                     run.checkpoints.save(epoch, member_state, learner.parts(member_state.learner))
@@ -158,10 +157,8 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
 
     results: Any
     summary, *results = task.evaluate(policy)
-    if is_first_process():
-        run.write_poses(*results)
-        write_json(run.path / EVALUATION_FILE, summary.to_dict())
-        plots.save(run.path, plots.pictures(run.metrics(), *results))
+    write_json(run.path / EVALUATION_FILE, summary.to_dict())
+    plots.save(run.path, plots.pictures(run.metrics(), *results))
     return summary
 
 
@@ -203,7 +200,7 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State,
 def open_board(run: Run, epoch: int) -> SummaryWriter:
     """Return TensorBoard's writer; it drops a stopped run's events that are later than an epoch."""
     purge_step = run.config.learner.n_env_steps(epoch) + 1 if epoch else None
-    return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
+    return SummaryWriter(str(run.path), purge_step=purge_step)
 
 
 def timed_epoch(job: Any, state: State, learner: LearnerConfig, epoch: int) -> tuple[State, dict[str, Any]]:
@@ -216,11 +213,9 @@ def timed_epoch(job: Any, state: State, learner: LearnerConfig, epoch: int) -> t
     return state, metrics | {f"speed/{name}_per_s": n / seconds for name, n in done.items()}
 
 
-def evaluation(run: Run, task: Task, policy: Any) -> dict[str, float]:
-    """Return the figures of a policy by their names in metrics; write its poses into the run's folder."""
-    summary, *results = task.evaluate(policy)
-    run.write_poses(*results)
-    figures = summary.to_dict()
+def evaluation(task: Task, policy: Any) -> dict[str, float]:
+    """Return the figures of a policy by their names in metrics."""
+    figures = task.evaluate(policy)[0].to_dict()
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
 
 

@@ -1,4 +1,4 @@
-"""The engines "mjx-step" and "warp": `mjx.step` of the compiled model, with nothing of ours in the arm.
+"""The engine "mjx-step": `mjx.step` of the compiled model, with nothing of ours in the arm.
 
 Tendons, springs, dampers, actuators, masses and the integrator are those of `mjx_softarm.mechanics.mjcf`. An
 episode's payload, stiffness and damping are fields of its model. The law stands outside the model, as for a
