@@ -140,9 +140,11 @@ def fit_pose(spec: ArmSpec, seed: int) -> PoseEstimator:
 
     # A polynomial for each section
     load_kg = np.asarray(pool.load_kg, float)[:, None]
+    moments = first_moments(estimator, length, sections, load_kg)
+    loads_kg = load_kg[:, None] * np.ones_like(length)
+    every = variables(length, bend, even.rotation, ups, moments, loads_kg)
     fits = list[tuple[np.ndarray, np.ndarray, np.ndarray]]()
-    for k, moment in enumerate(first_moments(estimator, length, sections, load_kg)):
-        x = variables(length[:, k], bend[:, k], even.rotation[:, k], ups[:, k], moment, load_kg)
+    for k, x in enumerate(np.moveaxis(every, 1, 0)):
         low, high = x.min(axis=0), x.max(axis=0)
         centre, scale = (low + high) / 2.0, np.maximum((high - low) / 2.0, LEAST_SCALE)
         terms = polynomial_terms((x - centre) / scale)  # (n, N_TERMS)
