@@ -101,8 +101,9 @@ def _run(
         seed: seed of all random draws
     """
     from calib import steps
+    from calib.arm import CalibratedArm
     from calib.report.page import warning_lines
-    from calib.run import calibrate, go_on, load_calibration, refuse_existing, write_calibration
+    from calib.run import Calibration, calibrate, go_on, refuse_existing, write_calibration
     from mjx_softarm._support import xla
     from mjx_softarm._support.provenance import provenance
 
@@ -113,7 +114,7 @@ def _run(
         raise InputError(f"--spec: got {spec} and --since {since}, which has its own, expected one")
     if since and s2r != "process":
         raise InputError(f"--s2r: got --since {since}, whose S2R stays, expected one of them")
-    known = load_calibration(since) if since else None
+    known = Calibration(CalibratedArm.read(since), ()) if since else None
     arm = known.arm.spec if known else ArmSpec.of(spec)
     if not (spec or since):
         print(f"arm: {arm.name}, by default; --spec names another arm")

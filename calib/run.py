@@ -101,15 +101,6 @@ def _run_steps(
     return calibration
 
 
-def load_calibration(folder: Path) -> Calibration:
-    """Read a calibration, without the sections of its report.
-
-    Raises:
-        InputError: a file is missing, damaged, or of another arm.
-    """
-    return Calibration(CalibratedArm.read(folder), ())
-
-
 def refuse_existing(folder: Path) -> None:
     """Refuse to overwrite a folder.
 

@@ -30,16 +30,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return cli.main("python -m mjx_softarm", about, commands, arguments)
 
 
-def _spec(arm: str = "paper", out: Path = Path("arm.toml"), force: bool = False) -> int:
+def _spec(arm: str = "paper", out: Path = Path("arm.toml")) -> int:
     """Write an arm's specification, every number with its unit and its source, to start your own from.
 
     Args:
         arm: paper, sopra, stiff-flop or four-chamber
         out: file to write
-        force: replace the file if there is one
     """
-    if out.exists() and not force:
-        raise InputError(f"--out: got {out}, which exists already, expected a new file, or --force")
+    if out.exists():
+        raise InputError(f"--out: got {out}, which exists already, expected a new file")
     out.write_text(shipped_arm(arm), "utf-8")
     print(f"wrote {out}; edit it, its name first, and use it with --spec {out}")
     return 0

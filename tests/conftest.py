@@ -20,7 +20,6 @@ from tests.arms import FOUR_CHAMBERS, OTHER_ARMS
 from tests.linear_arm import even_estimator
 from tests.networks import s2r_of
 
-jax.config.update("jax_num_cpu_devices", 8)  # most tests use one of them
 N_ARMS = 512  # in each call of `reset` and `step`: another number would compile anew
 
 

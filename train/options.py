@@ -57,7 +57,7 @@ class NewRunOptions(ArmOptions):
         Raises:
             InputError: there are some; the message names them.
         """
-        names = _differing(self, new, ("resume", "devices", "config"))
+        names = _differing(self, new, ("resume", "config"))
         names += _differing(getattr(self, "config", None), getattr(new, "config", None))
         if names:
             given = ", ".join(f"--{name}" for name in dict.fromkeys(names))

@@ -161,7 +161,6 @@ class MembersEpoch:
     def __init__(self, config: TrainConfig, env: ReachEnv):
         one = epoch_of(config.learner, env)
         self.config, self.env, self.kind, self.learner = config, env, one.kind, one.learner
-        self.mesh = self.sharding = None  # one device
 
     def first(self, key: tuple[Array, dict[str, Array]]) -> MembersState:
         """Return the first states of members, from their keys (n, 2) and numbers (n,)."""

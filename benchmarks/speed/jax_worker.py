@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from benchmarks.harness.common import n_cores
 from benchmarks.harness.rounds import Facts, serve
@@ -26,7 +26,6 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.gym import EPISODE_LENGTH
 from mjx_softarm.env.vector import VectorEnv
 from train.config import TrainConfig
-from train.epoch.devices import mesh_of, split
 from train.presets import PRESETS
 from train.runs.task import task_of
 
@@ -57,7 +56,12 @@ def mesh_of_cores(n_arms: int) -> Mesh | None:
     """
     _make_devices()
     n = max(n for n in range(1, n_cores() + 1) if n_arms % n == 0)
-    return mesh_of(n) if jax.default_backend() == "cpu" else None
+    return Mesh(np.array(jax.devices()[:n]), ("arms",)) if n > 1 and jax.default_backend() == "cpu" else None
+
+
+def spread(mesh: Mesh | None) -> NamedSharding | None:
+    """Return the sharding of arrays whose first axis is spread over the devices; None for one device."""
+    return NamedSharding(mesh, PartitionSpec(mesh.axis_names)) if mesh else None
 
 
 @functools.cache
@@ -107,7 +111,7 @@ def rollout(engine: Any, mode: Any, n: int, mesh: Mesh | None = None) -> Program
     few = VectorEnv(env, min(n, N_STARTS), EPISODE_LENGTH)
     state = xla.jit(few.reset, "once")(jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.resize(x, (n, *x.shape[1:])), jax.device_get(state))
-    state = jax.device_put(state, split(mesh) if mesh else None)
+    state = jax.device_put(state, spread(mesh))
     # Compile
     start, key = time.perf_counter(), jax.random.PRNGKey(1)
     compiled = xla.jit(run).lower(state, key).compile()

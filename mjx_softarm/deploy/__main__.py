@@ -122,7 +122,7 @@ def _run(
     Args:
         goal: pose of the tip [mm, deg] in the base frame, or X,Y,Z for a policy of positions; give the option
             again for a further one
-        log: file for the run's log; its suffix chooses CSV, npz or MCAP
+        log: file for the run's log; its suffix chooses CSV or npz
         duration: [s] of the arm after which the run ends
         stay: hold the last goal, until Ctrl-C or the end of the duration
     """

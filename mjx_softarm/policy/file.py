@@ -156,7 +156,7 @@ def policy_from_actor(
         **settings,
     )
     # Check the policy as if it had been read.
-    return checked(policy)
+    return _unpack(file_entries(policy), "policy")
 
 
 def actor_layers(actor_params: Mapping[str, Any], spec: ArmSpec) -> tuple[Layer, ...]:
@@ -200,15 +200,6 @@ def load_policy(path: str | Path) -> Policy:
             an entry is missing, unknown, or has a wrong type, shape or range.
     """
     return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
-
-
-def checked(policy: Policy) -> Policy:
-    """Return a policy as it would be read from its file.
-
-    Raises:
-        SealedFileError: the policy is not valid.
-    """
-    return _unpack(file_entries(policy), "policy")
 
 
 def file_entries(policy: Policy) -> dict[str, np.ndarray]:

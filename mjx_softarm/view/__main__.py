@@ -54,14 +54,11 @@ class Steered(ArmOptions):
             help_behavior_hint="(default: the package's own, calibrated to twin:0, or for the paper's arm)",
         ),
     ] = None
-    uncalibrated: bool = False
-    """drive twin:0 by the package's policy for the paper's arm, which was not calibrated to it"""
 
     @property
     def file(self) -> Path:
         """File of the policy."""
-        calibrated = re.fullmatch(r"twin:0(:\w+)*", self.arm) and not self.uncalibrated
-        return self.policy or (SHIPPED_TWIN if calibrated else SHIPPED)
+        return self.policy or (SHIPPED_TWIN if re.fullmatch(r"twin:0(:\w+)*", self.arm) else SHIPPED)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

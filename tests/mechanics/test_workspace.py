@@ -179,8 +179,6 @@ def test_spec_writes_the_default_arm_with_its_sources_and_replaces_nothing(tmp_p
     code, _, complaint = run("spec", "--out", path)
     assert code == 2 and "exists already" in complaint
     assert path.read_text("utf-8") == "mine"
-    assert run("spec", "--out", path, "--force")[0] == 0
-    assert ArmSpec.from_toml(path) == SPEC
 
 
 def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatch):

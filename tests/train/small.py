@@ -21,8 +21,8 @@ LEARNER = TQCConfig(**SETTINGS, hidden=(16, 16), hidden_critic=(16, 16), learnin
 CONFIG = TrainConfig(learner=LEARNER, env=EnvConfig(engine="chain", n_poses=256))  # compiles in seconds
 
 
-def new_job(config, env, mesh=None):
-    return Job(epoch_of(config.learner, env, mesh))
+def new_job(config, env):
+    return Job(epoch_of(config.learner, env))
 
 
 def distil_little(monkeypatch):

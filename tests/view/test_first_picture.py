@@ -29,7 +29,7 @@ def test_the_twin_goes_round_the_circle_and_tells_its_payload():
 
 
 def test_other_arms_and_a_switch_get_the_policy_of_the_paper_s_arm():
-    assert view.Steered(uncalibrated=True).file == view.Steered("my_arm:Arm").file == SHIPPED
+    assert view.Steered("my_arm:Arm").file == SHIPPED
     assert view.Steered("twin:1").file == view.Steered("twin:0@sopra").file == SHIPPED
     assert view.Steered("twin:0:500g").file == view.Steered().file == SHIPPED_TWIN
     assert view.Steered(policy=SHIPPED).file == SHIPPED

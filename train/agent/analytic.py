@@ -23,13 +23,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
-from jax.sharding import Mesh
 
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
@@ -41,7 +40,6 @@ from mjx_softarm.env.vector import VectorEnv, choose_arms, over_arms
 from mjx_softarm.mdp import rewards
 from train.agent.learner import LearnerConfig
 from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
-from train.epoch.devices import check_split, everywhere, split
 
 Params = Any  # a flax parameter tree
 MAX_GRADIENT_NORM = 1.0  # a longer gradient is shortened to this
@@ -179,21 +177,14 @@ class GradientEpoch:
     Args:
         config: hyperparameters.
         env: the arm.
-        mesh: devices over which the arms are spread, if there are several. Raises InputError where these
-            cannot be split evenly.
     """
 
     kind: xla.Kind = "arm"
 
-    def __init__(self, config: AnalyticConfig, env: ReachEnv, mesh: Mesh | None = None):
-        self.config, self.env, self.mesh = config, env, mesh
+    def __init__(self, config: AnalyticConfig, env: ReachEnv):
+        self.config, self.env = config, env
         self.learner = Analytic(env.observation_size, env.action_size, config)
-        self.arms = VectorEnv(env, config.n_arms, episode_length=1, mesh=mesh)
-        self.sharding = None
-        if mesh is not None:  # arms are spread, the networks are on all devices
-            check_split(config, ("n_arms",), mesh)
-            rows, on_all = cast(Any, split(mesh)), cast(Any, everywhere(mesh))  # stand-ins for arrays
-            self.sharding = GradientState(rows, on_all, on_all, on_all)
+        self.arms = VectorEnv(env, config.n_arms, episode_length=1)
 
     def first(self, key: Array) -> GradientState:
         """Return the state that a run begins with: a fresh policy, and arms at random poses."""
@@ -209,8 +200,7 @@ class GradientEpoch:
             The next state; means over the epoch by name. `env/unsettled` is the number of arms that did not
             settle.
         """
-        with draws.on(self.mesh):
-            state, metrics = jax.lax.scan(self._step, state, None, length=self.config.vector_steps_per_epoch)
+        state, metrics = jax.lax.scan(self._step, state, None, length=self.config.vector_steps_per_epoch)
         unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
         state = state._replace(n_epochs=state.n_epochs + 1)
         return state, jax.tree.map(jnp.mean, metrics) | {"env/unsettled": unsettled}
@@ -219,7 +209,7 @@ class GradientEpoch:
         """Take one gradient step, and one action of all arms."""
         key, key_arms = jax.random.split(state.key)
         # Act H times, and differentiate each arm's loss by each of its actions.
-        look_ahead = over_arms(jax.value_and_grad(self._loss, has_aux=True), self.mesh, 1)
+        look_ahead = over_arms(jax.value_and_grad(self._loss, has_aux=True), n_shared=1)
         changes = jnp.zeros((self.arms.n, self.config.horizon, self.env.action_size))
         ahead: _Ahead
         d_action: Array  # (B, H, A)

@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jax.sharding import Mesh
-
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import ReachEnv
 from train.agent.analytic import AnalyticConfig, GradientEpoch
@@ -25,7 +23,7 @@ class Entry(NamedTuple):
     """A learner: its config's type, and the function that makes its epoch."""
 
     config: type[LearnerConfig]
-    epoch: Callable[[Any, ReachEnv, Mesh | None, Demonstrations | None], Epoch]
+    epoch: Callable[[Any, ReachEnv, Demonstrations | None], Epoch]
     from_demonstrations: bool = False  # whether its goals are demonstrated poses, as `train imitate` has them
 
 
@@ -36,22 +34,20 @@ def with_replay(learner: Callable[[int, int, Any], Learner]) -> Callable[..., Ep
         learner: its class, called with the sizes of observation and action and with its config.
     """
 
-    def epoch(config: Any, env: ReachEnv, mesh: Mesh | None, _: Demonstrations | None) -> Epoch:
-        return ReplayEpoch(config, env, learner(env.observation_size, env.action_size, config), mesh=mesh)
+    def epoch(config: Any, env: ReachEnv, _: Demonstrations | None) -> Epoch:
+        return ReplayEpoch(config, env, learner(env.observation_size, env.action_size, config))
 
     return epoch
 
 
-def _gradient(config: Any, env: ReachEnv, mesh: Mesh | None, _: Demonstrations | None) -> Epoch:
-    return GradientEpoch(config, env, mesh)
+def _gradient(config: Any, env: ReachEnv, _: Demonstrations | None) -> Epoch:
+    return GradientEpoch(config, env)
 
 
-def _imitation(config: Any, env: ReachEnv, mesh: Mesh | None, shown: Demonstrations | None) -> Epoch:
+def _imitation(config: Any, env: ReachEnv, shown: Demonstrations | None) -> Epoch:
     if shown is None:
         raise InputError("learner: got 'imitation' without demonstrations, expected a file of them")
-    return ReplayEpoch(
-        config, env, Imitation(config, env, shown), DemonstratedGoals(config, env, shown), mesh
-    )
+    return ReplayEpoch(config, env, Imitation(config, env, shown), DemonstratedGoals(config, env, shown))
 
 
 LEARNERS = {
@@ -74,18 +70,15 @@ def learns_from_demonstrations(config: LearnerConfig) -> bool:
     return LEARNERS[name_of(config)].from_demonstrations
 
 
-def epoch_of(
-    config: LearnerConfig, env: ReachEnv, mesh: Mesh | None = None, shown: Demonstrations | None = None
-) -> Epoch:
+def epoch_of(config: LearnerConfig, env: ReachEnv, shown: Demonstrations | None = None) -> Epoch:
     """Return the epoch of the learner that a config is for.
 
     Args:
         config: settings of the learner.
         env: the arm.
-        mesh: devices, if there are several.
         shown: demonstrations, for a learner from these.
 
     Raises:
-        InputError: demonstrations are missing, or something cannot be split evenly over the devices.
+        InputError: demonstrations are missing.
     """
-    return LEARNERS[name_of(config)].epoch(config, env, mesh, shown)
+    return LEARNERS[name_of(config)].epoch(config, env, shown)

@@ -12,7 +12,6 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mechanics.workspace import Pool
-from train.epoch.devices import everywhere
 
 T = TypeVar("T")
 State = Any  # `ReplayState`, or `GradientState` of the learner `analytic`
@@ -25,9 +24,7 @@ class Epoch(Protocol):
     """
 
     env: ReachEnv
-    mesh: Any  # devices, if there are several
     kind: Any  # kind of program, see `xla.jit`: what most of its time goes to
-    sharding: State  # where the parts of a state are on several devices, a prefix of its tree; None for one
     learner: Any  # policy(state), mode(policy, obs), parts(state), adopt(state, parts)
 
     def first(self, key: Any) -> State:
@@ -50,7 +47,7 @@ class Job:
     """
 
     def __init__(self, epoch: Epoch, pool_of: Callable[[int], Pool] | None = None):
-        self.env, self.learner, self.mesh = epoch.env, epoch.learner, epoch.mesh
+        self.env, self.learner = epoch.env, epoch.learner
         self._pool_of = pool_of or (lambda k: epoch.env.pool)
         self.n_traces = 0
 
@@ -64,10 +61,8 @@ class Job:
             with epoch.env.poses.given(pool):
                 return epoch.advance(state)
 
-        self.sharding = epoch.sharding
-        results = None if self.mesh is None else (self.sharding, everywhere(self.mesh))
-        self._init = xla.jit(first, "once", out_shardings=self.sharding)
-        self._epoch = xla.jit(advance, epoch.kind, donate_argnums=0, out_shardings=results)
+        self._init = xla.jit(first, "once")
+        self._epoch = xla.jit(advance, epoch.kind, donate_argnums=0)
 
     def init(self, key: Any) -> State:
         """Return the state that a run begins with; `key` is what the epoch's `first` takes."""
@@ -82,10 +77,6 @@ class Job:
         key = jax.random.PRNGKey(0) if key is None else key
         return jax.eval_shape(self._init, key, self.env.poses.shapes)
 
-    def like(self) -> State:
-        """Return a state structured as the run's, or its shapes."""
-        return self.init(jax.random.PRNGKey(0)) if self.mesh else self.shapes()
-
     def compile_epoch(self) -> None:
         """Compile the epoch before it is called."""
         self._epoch = self._epoch.lower(self.shapes(), self.env.poses.shapes).compile()
@@ -93,19 +84,14 @@ class Job:
     def start(self, first: Callable[[], T]) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled meanwhile.
 
-        Another thread calls `first`; the pool of poses settles there. With a mesh the epoch is compiled when
-        it is called first; a second call compiles nothing.
+        Another thread calls `first`; the pool of poses settles there. A second call compiles nothing.
         """
-        if self.mesh is not None or self.n_traces:
+        if self.n_traces:
             return first()
         with ThreadPoolExecutor(1) as beside:
             result = beside.submit(first)
             self.compile_epoch()
             return result.result()
-
-    def place(self, state: State) -> State:
-        """Return the state on the devices where the epoch expects it, after something else has touched it."""
-        return state if self.sharding is None else jax.device_put(state, self.sharding)
 
     def policy(self, state: State) -> Any:
         """Return the parameters of the policy that is evaluated and exported."""

@@ -1,20 +1,18 @@
 """The epoch of a learner from the replay: act, step the arms, store, relabel, update.
 
 After each action of all arms, their transitions enter the replay. Then the learner takes some gradient steps
-on batches that are drawn uniformly from it, with goals exchanged in hindsight. With several devices, arms,
-replay and batches are spread over them; see `train.epoch.devices`.
+on batches that are drawn uniformly from it, with goals exchanged in hindsight.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.sharding import Mesh
 
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
@@ -26,7 +24,6 @@ from mjx_softarm.mdp.actions import N_ACTIONS
 from train.agent.hindsight import HindsightConfig, later_pose, relabel
 from train.agent.learner import Experience, LearnerConfig, Transition
 from train.epoch import replay
-from train.epoch.devices import check_split, everywhere, split, spread
 
 COUNTS = ("env/unsettled", "env/episodes", "env/successes")  # metrics summed over an epoch and its arms
 
@@ -138,26 +135,12 @@ class ReplayEpoch:
         env: the arm.
         learner: learner.
         goals: `train.agent.imitation.DemonstratedGoals`; None: as the environment draws starts and goals.
-        mesh: devices, if there are several. Raises InputError for what cannot be split evenly.
     """
 
-    def __init__(
-        self,
-        config: ReplayConfig,
-        env: ReachEnv,
-        learner: Learner,
-        goals: Any = None,
-        mesh: Mesh | None = None,
-    ):
-        self.config, self.env, self.learner, self.goals, self.mesh = config, env, learner, goals, mesh
+    def __init__(self, config: ReplayConfig, env: ReachEnv, learner: Learner, goals: Any = None):
+        self.config, self.env, self.learner, self.goals = config, env, learner, goals
         self.kind: xla.Kind = "arm" if env.uses_mjx else "networks"
-        self.arms = VectorEnv(env, config.n_arms, config.episode_length, mesh)
-        self.sharding = None
-        if mesh is not None:  # arms, replay and batches are spread, networks are on all devices
-            check_split(config, ("n_arms", "replay_capacity", "batch_size"), mesh)
-            rows, on_all = split(mesh), cast(Any, everywhere(mesh))  # stand-ins for arrays
-            memory = replay.Ring(data=rows, position=on_all, size=on_all)
-            self.sharding = ReplayState(rows, on_all, memory, on_all, on_all, on_all)
+        self.arms = VectorEnv(env, config.n_arms, config.episode_length)
 
     def first(self, key: Array) -> ReplayState:
         """Return the state that a run begins with: arms at their first starts, and an empty replay."""
@@ -179,9 +162,8 @@ class ReplayEpoch:
             The next state; means over the epoch by name. Counts are `env/unsettled`, the masked arms,
             `env/episodes` that ended, and `env/successes` that ended at their goals.
         """
-        with draws.on(self.mesh):
-            n_steps = self.config.vector_steps_per_epoch
-            state, metrics = jax.lax.scan(self._vector_step, state, jnp.arange(n_steps), length=n_steps)
+        n_steps = self.config.vector_steps_per_epoch
+        state, metrics = jax.lax.scan(self._vector_step, state, jnp.arange(n_steps), length=n_steps)
         counts = {name: jnp.sum(metrics.pop(name)) * self.config.n_arms for name in COUNTS}
         state = state._replace(n_epochs=state.n_epochs + 1)
         return state, jax.tree.map(jnp.mean, metrics) | counts
@@ -252,9 +234,9 @@ class ReplayEpoch:
         """Return a batch, with poses up to `hindsight.n_later` actions later in the same episode."""
         size, n_later = self.config.batch_size, self.config.hindsight.n_later
         if not n_later:
-            return spread(self.mesh, replay.sample(memory, key, size))
+            return replay.sample(memory, key, size)
         now, later, ahead = replay.sample_ahead(memory, key, size, self.arms.n, n_later)
-        return spread(self.mesh, now._replace(later_pose=later_pose(now, later, ahead)))
+        return now._replace(later_pose=later_pose(now, later, ahead))
 
     def relabel(self, stored: Experience, key: Array) -> Transition:
         """Return a batch to learn from; some of its B transitions have another goal."""

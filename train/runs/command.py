@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Self, cast
 
 import tyro
-from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
@@ -22,7 +21,6 @@ from mjx_softarm.env.config import ENGINES
 from train.agent.imitation import ImitationConfig
 from train.config import TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
-from train.epoch.devices import mesh_of
 from train.options import NewRunOptions, ReachOptions, named, start
 from train.presets import IMITATION_PRESETS
 from train.runs import run as runs
@@ -37,16 +35,13 @@ class Reach(ReachOptions):
     agent: cli.MaybePath = None
     """run whose policy this one begins with: one of TQC, with its critics; for analytic any run. The widths
     of its hidden layers are taken, too"""
-    devices: int = 1
-    """number of devices to spread arms, replay and batches over"""
 
     def __call__(self) -> int:
         console = start()
-        mesh = mesh_of(self.devices)
         if self.resume:
             self.check_resume_alone(self.default([]))
-            return _resume(self.resume, mesh, console)
-        return _begin("reach", self, self.config, {"agent": self.agent}, mesh, console)
+            return _resume(self.resume, console)
+        return _begin("reach", self, self.config, {"agent": self.agent}, console)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +61,6 @@ class Imitate(NewRunOptions):
     """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""
     reward: cli.MaybePath = None
     """run whose learned reward this one uses without training it"""
-    devices: int = 1
-    """number of devices to spread arms, replay and batches over"""
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
@@ -76,10 +69,9 @@ class Imitate(NewRunOptions):
 
     def __call__(self) -> int:
         console = start()
-        mesh = mesh_of(self.devices)
         if self.resume:
             self.check_resume_alone(self.default([]))
-            return _resume(self.resume, mesh, console)
+            return _resume(self.resume, console)
         if self.file is None:
             raise InputError("FILE: got nothing, expected the demonstrations, or --resume RUN")
         # Settings of the learned reward, which may be another run's.
@@ -94,7 +86,7 @@ class Imitate(NewRunOptions):
             )
         config = dataclasses.replace(self.config, learner=learner)
         donors = {"agent": self.agent, "reward": self.reward}
-        return _begin("imitate", self, config, donors, mesh, console, self.file)
+        return _begin("imitate", self, config, donors, console, self.file)
 
 
 def evaluate(
@@ -157,7 +149,6 @@ def _begin(
     options: Reach | Imitate,
     config: TrainConfig,
     donors: Mapping[str, Path | None],
-    mesh: Mesh | None,
     console: Console,
     demonstrations: Path | None = None,
 ) -> int:
@@ -168,7 +159,6 @@ def _begin(
         options: its options.
         config: settings of the run.
         donors: folders of runs that the new one takes parts of, `agent` and `reward`.
-        mesh: devices, if there are several.
         console: shows progress.
         demonstrations: file of demonstrations, if it learns from these.
     """
@@ -184,20 +174,20 @@ def _begin(
     if env.spec != arm.spec:
         n, n_specified = (spec.structure.links_per_section for spec in (env.spec, arm.spec))
         console.print(f"the arm has {n} links per section in this run, {n_specified} in its specification")
-    task = task_of(config, env, None if log is None else from_log(log, arm.spec), mesh)
+    task = task_of(config, env, None if log is None else from_log(log, arm.spec))
     first = runs.begin_with(task, config.seed, opened) if opened else None
-    path = options.out or runs.default_path(command, options.preset, config.seed)
+    path = options.out or runs.free_path(Path("runs") / f"{command}-{options.preset}-seed{config.seed}")
     begins_with = {name: run.path for name, run in opened.items()}
     run = Run.create(path, config, arm, log, begins_with, first, options.preset)
     return _train(run, task, console)
 
 
-def _resume(path: Path, mesh: Mesh | None, console: Console) -> int:
+def _resume(path: Path, console: Console) -> int:
     run = Run.open(path)
     if run.checkpoints.latest is None:
         run.check_begins_anew()
         console.print(f"{path}: no checkpoint yet, the run begins anew", highlight=False, soft_wrap=True)
-    return _train(run, runs.task_of_run(run, mesh), console)
+    return _train(run, runs.task_of_run(run), console)
 
 
 def _train(run: Run, task: Task, console: Console) -> int:

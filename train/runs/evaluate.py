@@ -42,7 +42,6 @@ class Reached(NamedTuple):
     pressure_kpa: Array  # (n, n_chambers)
     clearance_mm: Array  # (n,) body to the wall, in motion the least on the way; infinite without a pipe
     near_s: Array  # (n,) time until the tip is within NEAR_MM for good; infinite if never, NaN at rest
-    overshoot_mm: Array  # (n,) distance of the tip beyond the goal, along its way; NaN at rest
 
     @property
     def tip_error_mm(self) -> np.ndarray:
@@ -93,8 +92,6 @@ class Summary(Figures):
     # In motion only. The time `near_s` is infinite for an arm that is never within NEAR_MM for good.
     near_share: float | None = figure(f"within {NEAR_MM:g} mm for good", "%", 1, default=None)
     near_median_s: float | None = figure("  after, in the median of all", "s", 2, default=None)
-    overshoot_median_mm: float | None = figure("overshoot, median", "mm", 1, default=None)
-    overshoot_p95_mm: float | None = figure("overshoot, 95 %", "mm", 1, default=None)
 
 
 class Evaluator:
@@ -209,10 +206,10 @@ def reach(
     begin = towards(env, state, goal), jnp.zeros(6)
     (state, _), way = jax.lax.scan(act, begin, None, length=n_actions)
     arm = state.pipeline_state
-    near_s = overshoot_mm = jnp.asarray(jnp.nan)
+    near_s = jnp.asarray(jnp.nan)
     if env.config.moves:
         way_mm = jnp.concatenate([way["path_mm"].reshape(-1, 3), arm.pose[None, :3]])
-        near_s, overshoot_mm = way_figures(way_mm, goal[:3], 1.0 / env.spec.control.rate_hz)
+        near_s = time_near(way_mm, goal[:3], 1.0 / env.spec.control.rate_hz)
     return state, Reached(
         goal=goal,
         pose=arm.pose,
@@ -222,51 +219,34 @@ def reach(
         pressure_kpa=arm.pressure_kpa,
         clearance_mm=jnp.min(way["clearance_mm"]) if env.config.moves else state.info["clearance_mm"],
         near_s=near_s,
-        overshoot_mm=overshoot_mm,
     )
 
 
-def way_figures(way_mm: Array, goal_mm: Array, period_s: float) -> tuple[Array, Array]:
-    """Return when a tip came near its goal for good [s], and how far it went beyond it [mm], both ().
+def time_near(way_mm: Array, goal_mm: Array, period_s: float) -> Array:
+    """Return when a tip came near its goal for good, () [s].
 
     Args:
         way_mm (t, 3): positions of the tip, a control period apart, the first where it began.
         goal_mm (3,): the goal.
         period_s: control period.
     """
-    off_mm = way_mm - goal_mm
-    far = jnp.linalg.norm(off_mm, axis=-1) > NEAR_MM
+    far = jnp.linalg.norm(way_mm - goal_mm, axis=-1) > NEAR_MM
     last_far = jnp.max(jnp.where(far, jnp.arange(1, len(way_mm) + 1), 0))
-    near_s = jnp.where(far[-1], jnp.inf, period_s * last_far)
-    begin_mm = jnp.linalg.norm(off_mm[0])
-    along_mm = off_mm @ (-off_mm[0] / jnp.maximum(begin_mm, 1e-6))
-    return near_s, jnp.maximum(jnp.max(along_mm), 0.0)
-
-
-def follow(
-    env: ReachEnv,
-    learner: Any,
-    policy: Any,
-    path: Array,
-    state: State,
-    n_actions: int = N_ACTIONS,
-    shift_limit: np.ndarray = UNCORRECTED,
-) -> Reached:
-    """Return the results of one arm, from a state, along a path (n, 6) of goals."""
-
-    def go_on(state: State, goal: Array) -> tuple[State, Reached]:
-        return reach(env, learner, policy, state, goal, n_actions, shift_limit)
-
-    return jax.lax.scan(go_on, state, path)[1]
+    return jnp.where(far[-1], jnp.inf, period_s * last_far)
 
 
 def follower(
     env: ReachEnv, learner: Any, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
 ) -> Callable[[Any, Array, Array], Reached]:
-    """Return the function of policy, path and key that follows a path from a random start."""
-    return lambda policy, path, key: follow(
-        env, learner, policy, path, env.reset(key), n_actions, shift_limit
-    )
+    """Return the function of policy, path (n, 6) of goals and key, of one arm that begins at a random pose."""
+
+    def follow(policy: Any, path: Array, key: Array) -> Reached:
+        def go_on(state: State, goal: Array) -> tuple[State, Reached]:
+            return reach(env, learner, policy, state, goal, n_actions, shift_limit)
+
+        return jax.lax.scan(go_on, env.reset(key), path)[1]
+
+    return follow
 
 
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:
@@ -279,13 +259,11 @@ def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: flo
 
     # Figures of motion, where the arms moved.
     motion = {}
-    if np.isfinite(workspace.overshoot_mm).all():
+    if not np.isnan(workspace.near_s).any():
         median_s = float(np.quantile(workspace.near_s, 0.5, method="higher"))  # some are infinite
         motion = {
             "near_share": float(np.mean(np.isfinite(workspace.near_s))),
             "near_median_s": median_s if np.isfinite(median_s) else None,
-            "overshoot_median_mm": float(np.median(workspace.overshoot_mm)),
-            "overshoot_p95_mm": float(np.quantile(workspace.overshoot_mm, 0.95)),
         }
     return Summary(
         median_mm=float(np.median(error)),

@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
@@ -63,7 +62,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
     def first() -> tuple[int, State]:
         if run.checkpoints.latest is None:
             return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
-        return run.checkpoints.restore(task.job.like())
+        return run.checkpoints.restore(task.job.shapes())
 
     (summary,) = train_together(task.job, [(run, task)], begin, run.path, console)
     return summary
@@ -101,7 +100,10 @@ def train_together(
         epoch, state = begin()
         if epoch:
             console.print(f"continuing after epoch {epoch} of {n_epochs}")
-        boards = [stack.enter_context(open_board(run, epoch)) for run, _ in members]
+        later = config.learner.n_env_steps(epoch) + 1 if epoch else None  # events that a stopped run has left
+        boards = [
+            stack.enter_context(SummaryWriter(str(run.path), purge_step=later)) for run, _ in members
+        ]
         show = stack.enter_context(shown_progress(config, epoch, console))
         while epoch < n_epochs:
             # Train an epoch. Metrics without an axis of members are the same for all.
@@ -162,14 +164,13 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     return summary
 
 
-def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
+def task_of_run(run: Run) -> Task:
     """Return the task of a run.
 
     Raises:
         InputError: its demonstrations cannot be read.
-        InputError: it cannot be split evenly over the devices of the mesh.
     """
-    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations(), mesh)
+    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations())
 
 
 def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State, dict[str, Any]]:
@@ -194,13 +195,7 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State,
             state = state._replace(learner=learner.adopt(state.learner, parts))
         except ValueError as error:
             raise InputError(f"{donor.path}: {error}") from error
-    return (state := task.job.place(state)), task.job.parts(state)
-
-
-def open_board(run: Run, epoch: int) -> SummaryWriter:
-    """Return TensorBoard's writer; it drops a stopped run's events that are later than an epoch."""
-    purge_step = run.config.learner.n_env_steps(epoch) + 1 if epoch else None
-    return SummaryWriter(str(run.path), purge_step=purge_step)
+    return state, task.job.parts(state)
 
 
 def timed_epoch(job: Any, state: State, learner: LearnerConfig, epoch: int) -> tuple[State, dict[str, Any]]:
@@ -293,11 +288,6 @@ def asked_to_stop() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def default_path(task: str, preset: str, seed: int) -> Path:
-    """Return `runs/TASK-PRESET-seedN`, or the first free path numbered after it."""
-    return free_path(Path("runs") / f"{task}-{preset}-seed{seed}")
 
 
 def free_path(base: Path) -> Path:

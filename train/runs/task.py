@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jax.sharding import Mesh
 
 from mjx_softarm.env import ReachEnv
 from train.agent.registry import epoch_of, learns_from_demonstrations
@@ -28,7 +27,6 @@ def task_of(
     config: TrainConfig,
     env: ReachEnv,
     demonstrations: Demonstrations | None = None,
-    mesh: Mesh | None = None,
 ) -> Task:
     """Return the task of a run.
 
@@ -36,13 +34,11 @@ def task_of(
         config: settings of the run.
         env: environment of its arms.
         demonstrations: demonstrations to learn from, for a learner from demonstrations.
-        mesh: devices to train on; None is one device.
 
     Raises:
-        InputError: the learner needs demonstrations and has none, or the run cannot be split evenly over the
-            devices of the mesh.
+        InputError: the learner needs demonstrations and has none.
     """
-    epoch = epoch_of(config.learner, env, mesh, demonstrations)
+    epoch = epoch_of(config.learner, env, demonstrations)
     if learns_from_demonstrations(config.learner):
         return _at_positions(epoch, demonstrations)
     return Task(Job(epoch, fresh_poses(config, env)), Evaluator(env, epoch.learner), lambda state, k: state)
@@ -59,6 +55,6 @@ def _at_positions(epoch: Any, demonstrations: Any) -> Task:
 
     def prepare(state: State, k: int) -> State:
         errors_mm = lambda: evaluate(job.policy(state))[0].error_mm  # noqa: E731
-        return job.place(epoch.goals.prepare(state, k, errors_mm))
+        return epoch.goals.prepare(state, k, errors_mm)
 
     return Task(job, evaluate, prepare)

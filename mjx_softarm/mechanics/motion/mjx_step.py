@@ -123,9 +123,7 @@ def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
 
 def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mjx.Data, Array, Array]:
     """Return data at q and velocity (nv,), spring lengths (n_springs,) [m] and chamber volumes, as felt."""
-    data = mjx.kinematics(model, arm.data.replace(qpos=q, qvel=velocity))
-    if model.impl == mjx.Impl.JAX:  # its tendons need the bodies' motion axes
-        data = mjx.com_pos(model, data)
+    data = mjx.com_pos(model, mjx.kinematics(model, arm.data.replace(qpos=q, qvel=velocity)))
     data, params = mjx.tendon(model, data), arm.params
     area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
     volume = pneumatics.volume_m3(chamber_lengths(data, len(params.area)), *area, params.free_length_m)
@@ -135,8 +133,6 @@ def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mj
 
 def _with_friction(arm: MovingArm, model: mjx.Model, data: mjx.Data) -> mjx.Model:
     """Return the model with the chambers' dry friction in the damping of their tendons."""
-    if model.impl != mjx.Impl.JAX:  # the configuration allows no friction there
-        return model
     n_chambers = len(arm.params.area)  # their tendons come first
     rate = data._impl.ten_J[:n_chambers] @ data.qvel  # (n_chambers,) [m/s]
     friction = friction_damping(arm.own.friction_n, rate)

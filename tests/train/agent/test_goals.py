@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 @pytest.fixture(scope="module")
 def epoch(imitation_config, short_env, shown):
-    return epoch_of(imitation_config.learner, short_env, None, shown)
+    return epoch_of(imitation_config.learner, short_env, shown)
 
 
 @pytest.fixture(scope="module")

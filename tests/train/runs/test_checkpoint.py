@@ -59,7 +59,7 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
         "imitation": config.learner,
     }
     for name, learner_config in configs.items():
-        learner = epoch_of(learner_config, short_env, None, shown).learner
+        learner = epoch_of(learner_config, short_env, shown).learner
         run = Run.create(tmp_path / name, config, CalibratedArm(short_env.spec))
         with pytest.raises(InputError, match="got no checkpoint, expected one"):
             run.policy()

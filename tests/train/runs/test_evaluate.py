@@ -11,7 +11,7 @@ import pytest
 from mjx_softarm.env.state import State
 from mjx_softarm.mdp.rewards import RewardConfig
 from train.runs import evaluate
-from train.runs.evaluate import Evaluator, Reached, reach, summarise, way_figures
+from train.runs.evaluate import Evaluator, Reached, reach, summarise, time_near
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -29,7 +29,6 @@ def reached(error_mm, scaled_error, saturated, settled):
         pressure_kpa=np.zeros((n, 9)),
         clearance_mm=np.full(n, np.inf),
         near_s=np.full(n, np.nan),
-        overshoot_mm=np.full(n, np.nan),
     )
 
 
@@ -144,24 +143,21 @@ def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, reward, left):
     np.testing.assert_array_equal(found.goal, goal)
 
 
-def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():
+def test_when_a_tip_is_near_for_good():
     x = np.array([40.0, 20.0, 4.0, -8.0, -3.0, 1.0])  # near, beyond by 8 mm, near again
     way = jnp.asarray(np.stack([x, 0.0 * x, 0.0 * x], axis=-1))
-    near_s, overshoot_mm = way_figures(way, jnp.zeros(3), 0.02)
-    assert near_s == pytest.approx(0.08) and overshoot_mm == pytest.approx(8.0)
-    assert np.isinf(way_figures(way[:4], jnp.zeros(3), 0.02)[0])
-    assert way_figures(way[4:], jnp.zeros(3), 0.02)[0] == 0.0
+    assert time_near(way, jnp.zeros(3), 0.02) == pytest.approx(0.08)
+    assert np.isinf(time_near(way[:4], jnp.zeros(3), 0.02))
+    assert time_near(way[4:], jnp.zeros(3), 0.02) == 0.0
 
 
 def test_figures_of_a_motion():
     still = reached([1.0, 9.0, 2.0], [0.01] * 3, [0] * 3, [True] * 3)
-    moving = still._replace(near_s=np.array([0.4, np.inf, 0.8]), overshoot_mm=np.array([0.0, 1.0, 2.0]))
+    moving = still._replace(near_s=np.array([0.4, np.inf, 0.8]))
     at_rest = summarise(still, still, still, 0.03)
     assert at_rest.near_share is None and "near_share" not in at_rest.to_dict()
     figures = summarise(moving, moving, moving, 0.03)
     assert (figures.near_share, figures.near_median_s) == (pytest.approx(2 / 3), pytest.approx(0.8))
     never = moving._replace(near_s=np.array([0.4, np.inf, np.inf]))
     assert summarise(never, moving, moving, 0.03).near_median_s is None  # at one of three alone
-    assert figures.overshoot_median_mm == 1.0 and len(figures.rows()) == 4 + len(
-        summarise(still, still, still, 0.03).rows()
-    )
+    assert len(figures.rows()) == 2 + len(at_rest.rows())
