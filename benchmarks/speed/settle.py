@@ -1,8 +1,9 @@
 """Speed and error of methods that find an arm's equilibrium, over links per section.
 
-The methods are Newton's method with the closed-form chain, the same with MJX kinematics, and C MuJoCo stepped
-in time under the control law. They take turns, on all cores. Errors are distances of the tip from the
-solution in double precision, which `tests/mechanics/test_settle.py` compares with C MuJoCo stepped to rest.
+The methods are Newton's method with the closed-form chain, the same with MJX's pass at its solution, and C
+MuJoCo stepped in time under the control law. They take turns, on all cores. Errors are distances of the tip
+from the solution in double precision, which `tests/mechanics/test_settle.py` compares with C MuJoCo stepped
+to rest.
 """
 
 from __future__ import annotations

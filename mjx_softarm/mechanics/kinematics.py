@@ -1,11 +1,11 @@
-"""Poses of the plates and of the joints, from MJX or from the closed-form chain.
+"""Poses of the plates and of the joints, of the closed-form chain; `frames_of` reads them from MJX's data.
 
 The arm is a chain of links. Each link joins a plate to the next one by a slide along the
 parent plate's -z (positive = extension) and two perpendicular hinges half a link below. The first link
 turns about x and then y, the next one about y and then x, and so on: in the same order, the hinges' small
 twists would add up, and an arm bent sideways would turn about its length.
 Joint coordinates are `q (3 * n_links,)`, ordered (slide [m], first hinge [rad], second hinge [rad]) link
-by link. Both engines return the same `Frames`; everything downstream is shared.
+by link.
 
 Many arms come last in every shape, (..., *arms): one instruction then serves several arms. For one arm,
 *arms is empty. A number that all arms share may have a 1 in their place.

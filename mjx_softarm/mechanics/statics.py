@@ -91,7 +91,7 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
     """Return gradient and Hessian of V(q) at fixed pressures.
 
     Args:
-        frames: of `q`, from either engine.
+        frames: of `q`.
         q (nv, *arms): joint coordinates [m, rad, rad].
         pressure_kpa (n_chambers, *arms): chamber pressures.
         params: numbers of the arm.

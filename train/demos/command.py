@@ -17,7 +17,7 @@ from mjx_softarm.deploy.drivers import names
 from mjx_softarm.deploy.drivers.names import check_number
 from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, save_log
 from mjx_softarm.logs.files import check_file
-from mjx_softarm.logs.schema import TABLES, Log
+from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 from train.demos.demonstrations import from_log, read_demonstrations
 from train.demos.expert import Expert
@@ -39,7 +39,7 @@ class Record(ArmOptions):
 
     def __call__(self) -> int:
         console = start()
-        check_file("--out", self.out, TABLES)
+        check_file("--out", self.out)
         if self.out.exists():
             raise InputError(f"--out: got {self.out}, which is there already, expected a new file")
         # Plan all postures before the arm moves.

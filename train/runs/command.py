@@ -28,6 +28,7 @@ from train.runs.evaluate import N_ACTIONS
 from train.runs.folder import Run, sole_trainer
 from train.runs.task import Task, task_of
 
+
 @dataclass(frozen=True, kw_only=True)
 class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""

@@ -238,7 +238,7 @@ def time_near(way_mm: Array, goal_mm: Array, period_s: float) -> Array:
 def follower(
     env: ReachEnv, learner: Any, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
 ) -> Callable[[Any, Array, Array], Reached]:
-    """Return the function of policy, path (n, 6) of goals and key, of one arm that begins at a random pose."""
+    """Return the function of policy, path (n, 6) of goals and key by which an arm follows the path."""
 
     def follow(policy: Any, path: Array, key: Array) -> Reached:
         def go_on(state: State, goal: Array) -> tuple[State, Reached]:

@@ -101,9 +101,7 @@ def train_together(
         if epoch:
             console.print(f"continuing after epoch {epoch} of {n_epochs}")
         later = config.learner.n_env_steps(epoch) + 1 if epoch else None  # events that a stopped run has left
-        boards = [
-            stack.enter_context(SummaryWriter(str(run.path), purge_step=later)) for run, _ in members
-        ]
+        boards = [stack.enter_context(SummaryWriter(str(run.path), purge_step=later)) for run, _ in members]
         show = stack.enter_context(shown_progress(config, epoch, console))
         while epoch < n_epochs:
             # Train an epoch. Metrics without an axis of members are the same for all.

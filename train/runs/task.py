@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-
 from mjx_softarm.env import ReachEnv
 from train.agent.registry import epoch_of, learns_from_demonstrations
 from train.config import TrainConfig
