@@ -105,6 +105,7 @@ def _remedies(parts: Budget) -> dict[str, str]:
     again = "`python -m calib run LOG --since CALIBRATION` with this log, then `train export --calibration`"
     anew = "record poses anew, and calibrate with them"
     more = "record more random poses, and calibrate with them"
+    weigh = "measure a dozen goals with a known weight, and calibrate with them (docs/why.md)"
     if parts.n_goals < MIN_GOALS:
         again = f"{parts.n_goals} goals do not show a change beyond chance: measure {MIN_GOALS} or more"
         anew = again
@@ -115,7 +116,7 @@ def _remedies(parts: Budget) -> dict[str, str]:
         "law": f"{off}, saturated at {parts.n_saturated} goals: take goals further inside, or less payload"
         if parts.n_saturated
         else f"{off} although no chamber is saturated: look for a leak or a slow regulator",
-        "payload": f"the loop believes {parts.believed_g:.0f} g, and --payload says {hung_g:.0f} g: {more}",
+        "payload": f"the loop believes {parts.believed_g:.0f} g, and --payload says {hung_g:.0f} g: {weigh}",
         "springs": f"zeros have shifted since the calibration, about [mm]: {zeros}: {again}",
         "S2R": f"as large as at the calibration's held-out poses: {more}",
         # `--since` fits the springs' zeros, which explain the part `springs` alone.
