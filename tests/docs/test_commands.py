@@ -133,6 +133,13 @@ def test_the_readme_s_policy_acts(tmp_path, monkeypatch):
     assert found["reference"].length_m.shape == (9,)
 
 
+def test_a_program_of_one_s_own_gives_goals(tmp_path, monkeypatch, capsys):
+    shutil.copy(SHIPPED, tmp_path / "policy.npz")
+    monkeypatch.chdir(tmp_path)
+    exec(python_blocks("docs/deploy.md")[0].replace("500", "20"), {})
+    assert len(capsys.readouterr().out.splitlines()) >= 22  # a tick each
+
+
 # Journeys: the commands of the pages in the order of the site, with fewer poses and steps.
 NAMES = ("your-arm", "why", "calibrate", "train", "deploy", "export", "see")
 JOURNEY = ("README.md", *(f"docs/{name}.md" for name in NAMES))
