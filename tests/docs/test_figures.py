@@ -150,7 +150,7 @@ def arm_rows():
         ("`stiff-flop`, 165 mm", "stiff-flop", "arms"),
         ("`four-chamber`, 300 mm", "four-chamber", "arms"),
         (
-            "the paper's, upright ([`arms-upright.json`](results/arms-upright.json))",
+            "the paper's at a tenth of its mass, upright ([`arms-upright.json`](results/arms-upright.json))",
             "upright",
             "arms-upright",
         ),

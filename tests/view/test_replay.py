@@ -66,8 +66,7 @@ def test_command_line(path, tmp_path, capsys):
         ((path, "--html", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .html or .htm"),
         (("--demos", tmp_path / "a.mcap"), "a.mcap, expected a name that ends in .csv or .npz"),
         ((tmp_path / "no.csv",), "no.csv"),
-        ((tmp_path / "other",), "expected the folder of a run, with config.json, or of a calibration"),
-        ((tmp_path, tmp_path), "and more, expected one folder"),
+        ((tmp_path / "other",), "other: got 'Is a directory', expected a log"),
     ):
         assert main([*map(str, words)]) == 2
         assert message in (error := capsys.readouterr().err) and error.count("\n") == 1

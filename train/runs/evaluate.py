@@ -235,18 +235,30 @@ def time_near(way_mm: Array, goal_mm: Array, period_s: float) -> Array:
     return jnp.where(far[-1], jnp.inf, period_s * last_far)
 
 
+def follow(
+    env: ReachEnv,
+    learner: Any,
+    policy: Any,
+    path: Array,
+    state: State,
+    n_actions: int = N_ACTIONS,
+    shift_limit: np.ndarray = UNCORRECTED,
+) -> Reached:
+    """Return the results of one arm, from a state, along a path (n, 6) of goals."""
+
+    def go_on(state: State, goal: Array) -> tuple[State, Reached]:
+        return reach(env, learner, policy, state, goal, n_actions, shift_limit)
+
+    return jax.lax.scan(go_on, state, path)[1]
+
+
 def follower(
     env: ReachEnv, learner: Any, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
 ) -> Callable[[Any, Array, Array], Reached]:
-    """Return the function of policy, path (n, 6) of goals and key by which an arm follows the path."""
-
-    def follow(policy: Any, path: Array, key: Array) -> Reached:
-        def go_on(state: State, goal: Array) -> tuple[State, Reached]:
-            return reach(env, learner, policy, state, goal, n_actions, shift_limit)
-
-        return jax.lax.scan(go_on, env.reset(key), path)[1]
-
-    return follow
+    """Return the function of policy, path and key that follows a path from a random start."""
+    return lambda policy, path, key: follow(
+        env, learner, policy, path, env.reset(key), n_actions, shift_limit
+    )
 
 
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:

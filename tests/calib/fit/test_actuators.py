@@ -188,7 +188,7 @@ def test_a_log_without_commands_or_of_poses_alone_says_so(short):
     log = log_of(short, short.actuators)
     rows = np.arange(0, len(log), 50)
     for unfit in (dataclasses.replace(log, commanded_kpa=None), log.take(rows)):
-        arm, section, _ = actuators(measure([unfit], short), CalibratedArm(short), 0)
+        arm, section = actuators(measure([unfit], short), CalibratedArm(short), 0)
         assert (
             arm.spec == short
             and "No log has commands and pressures" in section.text
