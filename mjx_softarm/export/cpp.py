@@ -243,27 +243,26 @@ class _Body:
         repeats = int(np.argmax(flat != start))
         if np.array_equal(flat, count // repeats):
             return f"{_one(i)} / {repeats}"
-        # Rows that are alike: the place of a row, then the place within it
+        # Rows that are alike: the place where a row begins, and the place within it
         n = places.shape[-1]
         rows = flat.reshape(-1, n)
-        step = int(rows[-1, 0] - rows[0, 0]) // max(len(rows) - 1, 1)
-        if len(rows) > 1 and np.array_equal(rows, rows[0] + step * np.arange(len(rows))[:, None]):
-            return f"{step} * ({_one(i)} / {n}) + {self._places(rows[0], f'({_one(i)} % {n})')}"
+        within = rows[0] - start
+        if len(rows) > 1 < n and np.array_equal(rows, rows[:, :1] + within):
+            row = self._places(places[..., 0], f"({_one(i)} / {n})")
+            return f"{_one(row)} + {_one(self._places(within, f'({_one(i)} % {n})'))}"
         return f"{self._numbers.name(flat.astype(np.int32))}[{i}]"
 
     def _matmul(self, item: Symbol, name: str) -> None:
         a, b = item.operands
         n_rows, n_inner = (1, *a.shape)[-2:] if b.ndim > 2 else (a.size // a.shape[-1], a.shape[-1])
         n_columns = 1 if b.ndim == 1 else b.shape[-1]
-        n_batch, n_right = math.prod(item.shape[:-2]) if b.ndim > 2 else 1, math.prod(b.shape[:-2])
+        n_batch = math.prod(b.shape[:-2])
         n_own = n_batch if b.ndim > 2 and a.ndim > 2 else 1  # a single left matrix serves the whole batch
-        # The right matrices may repeat over further leading axes of the left ones
-        if b.ndim > 2 and (n_own != math.prod(a.shape[:-2]) or item.shape[-b.ndim : -2] != b.shape[:-2]):
+        if b.ndim > 2 and n_own != math.prod(a.shape[:-2]):
             raise NotImplementedError(f"matmul: got {a.shape} and {b.shape}, expected equal leading axes")
         batch, row, inner, column = ("b", n_batch), ("r", n_rows), ("k", n_inner), ("c", n_columns)
         x = self._value(a, _flat(("b", n_own), row, inner))
-        right = ("b" if n_right == n_batch else f"(b % {n_right})", n_right)
-        weight = self._value(b, _flat(right, inner, column))
+        weight = self._value(b, _flat(batch, inner, column))
         target = f"{name}[{_flat(batch, row, column)}]"
         outside, columns = "".join(map(_for, (batch, row))), _for(column)
         self.lines += [

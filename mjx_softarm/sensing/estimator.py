@@ -92,7 +92,7 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
         ups = directions_up(estimator, sections)
         x = variables(length, bend, even.rotation, ups, moments, loads_kg)
         x = xp.clip((x - estimator.variable_centre) / estimator.variable_scale, -1.0, 1.0)
-        change = (polynomial_terms(x)[..., None, :] @ estimator.coefficient)[..., 0, :]
+        change = _change(estimator, x)
         quaternion = xp.concat([xp.ones_like(change[..., :1]), change[..., 3:]], axis=-1)
         turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
         sections = Frame(even.position_m + change[..., :3], turn @ even.rotation)
@@ -102,6 +102,16 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     tip_m = plate.position_m + plate.rotation @ estimator.tip_offset_m
     tip = Frame(tip_m, plate.rotation @ estimator.tip_rotation)
     return _from_base(Frame(estimator.base_position_m, estimator.base_rotation), tip)
+
+
+def _change(estimator: PoseEstimator, x: Array) -> Array:
+    """Return the change (..., n_sections, N_CHANGES) of each section's end at scaled `variables`."""
+    xp = array_namespace(x)
+    # Terms come first: NumPy gathers whole rows of a batch nine times as fast as single numbers
+    terms = polynomial_terms(xp.swapaxes(x.reshape(-1, *x.shape[-2:]), 0, 2))  # (N_TERMS, n_sections, batch)
+    change = xp.swapaxes(xp.asarray(estimator.coefficient), 1, 2) @ xp.swapaxes(terms, 0, 1)
+    change = xp.swapaxes(xp.swapaxes(change, 0, 2), 1, 2)  # (batch, n_sections, N_CHANGES)
+    return change.reshape(*x.shape[:-1], N_CHANGES)
 
 
 def directions_up(estimator: PoseEstimator, sections: Frame) -> Array:
@@ -165,12 +175,12 @@ def variables(
 
 
 def polynomial_terms(x: Array) -> Array:
-    """Return the products (..., N_TERMS) of variables (..., N_VARIABLES) that the polynomial adds up."""
+    """Return the products (N_TERMS, ...) of variables (N_VARIABLES, ...) that the polynomial adds up."""
     xp = array_namespace(x)
-    products = [xp.ones_like(x[..., :1])]
+    products = [xp.ones_like(x[:1])]
     for parent, factor in _PRODUCTS:
-        products.append(products[-1][..., parent] * x[..., factor])
-    return xp.concat(products, axis=-1)
+        products.append(products[-1][parent] * x[factor])
+    return xp.concat(products, axis=0)
 
 
 def _products() -> list[tuple[np.ndarray, np.ndarray]]:

@@ -76,7 +76,7 @@ N_SINGLE = 200  # single rows of the fixture `golden`, a fifth of an export's
 @contextlib.contextmanager
 def few_golden_rows(run_ticks=30):
     """Golden rows made in here are few; runs end after so many ticks."""
-    few = {"N_SINGLE": 40, "N_CHECKED": 8, "_CANDIDATES": 60, "_RUN_TICKS": run_ticks}
+    few = {"N_SINGLE": 40, "N_CHECKED": 4, "_CANDIDATES": 30, "_RUN_TICKS": run_ticks}
     with pytest.MonkeyPatch.context() as patch:
         for name, number in few.items():
             patch.setattr(golden_rows, name, number)
@@ -98,8 +98,8 @@ def controller(policy_file):
 
 @pytest.fixture(scope="session")
 def golden(controller, policy_file):
-    """Rows of all kinds; the runs are as long as an export's."""
-    few = {"N_SINGLE": N_SINGLE, "N_CHECKED": 24, "_CANDIDATES": 120}
+    """Rows of all kinds and faults, fewer than an export has."""
+    few = {"N_SINGLE": N_SINGLE, "N_CHECKED": 24, "_CANDIDATES": 110}
     with pytest.MonkeyPatch.context() as patch:
         for name, number in few.items():
             patch.setattr(golden_rows, name, number)

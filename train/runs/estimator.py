@@ -147,11 +147,11 @@ def fit_pose(spec: ArmSpec, seed: int) -> PoseEstimator:
     for k, x in enumerate(np.moveaxis(every, 1, 0)):
         low, high = x.min(axis=0), x.max(axis=0)
         centre, scale = (low + high) / 2.0, np.maximum((high - low) / 2.0, LEAST_SCALE)
-        terms = polynomial_terms((x - centre) / scale)  # (n, N_TERMS)
-        size = np.maximum(np.sqrt(np.mean(terms**2, axis=0)), LEAST_SCALE)
-        terms /= size
-        square = terms.T @ terms / len(terms) + RIDGE * np.eye(N_TERMS)
-        weights = np.linalg.solve(square, terms.T @ changes[:, k] / len(terms))
+        terms = polynomial_terms(((x - centre) / scale).T)  # (N_TERMS, n)
+        size = np.maximum(np.sqrt(np.mean(terms**2, axis=1)), LEAST_SCALE)
+        terms /= size[:, None]
+        square = terms @ terms.T / len(x) + RIDGE * np.eye(N_TERMS)
+        weights = np.linalg.solve(square, terms @ changes[:, k] / len(x))
         fits.append((weights / size[:, None], centre, scale))
     coefficient, centre, scale = (np.stack(parts) for parts in zip(*fits, strict=True))
     return estimator._replace(coefficient=coefficient, variable_centre=centre, variable_scale=scale)
