@@ -207,6 +207,7 @@ def minutes_figure(rows: Sequence[Row]) -> Figure:
         line = [[row["recording [min]"], row["circle, mean [mm]"]] for row in group]
         x, y = np.array(sorted(line)).T
         panel.plot(x, y, "o-", color=colours[arm], markersize=4.0, label=TITLES.get(arm, arm))
+    panel.set_xlim(left=0.0)
     panel.set_ylim(bottom=0.0)
     handles, labels = panel.get_legend_handles_labels()
     legend = dict(zip(labels, handles, strict=True))  # each once

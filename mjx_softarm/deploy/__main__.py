@@ -35,7 +35,7 @@ from mjx_softarm.deploy.measure import (
     whole_goal,
     write_accuracy,
 )
-from mjx_softarm.deploy.record import record
+from mjx_softarm.deploy.record import ACCURACY, record
 from mjx_softarm.deploy.session import LoopRun, follow, trace
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import Log
@@ -277,6 +277,7 @@ def _record(
         tell(f"{options.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results
+    tell(ACCURACY)
     targets_kpa = growing(random_pressures(arm_spec, poses, seed))
     result = record(driver, arm_spec, targets_kpa, tell, partial(save_log, out))
     finish(driver, tell)

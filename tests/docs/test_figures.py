@@ -169,6 +169,16 @@ def arm_rows():
         yield row(title, circle, share, f"{turn:.1f}", f"{made['grid, mean [mm]']:.1f} at {goals}")
 
 
+def test_minutes_of_recording_are_those_of_the_file():
+    made = figures("arms-minutes")["arms"]
+    page = " ".join((ROOT / "docs/trust.md").read_text("utf-8").split())
+    for n_poses, minutes in ((60, "Six to ten minutes brought"), (150, "ten to twenty-six")):
+        rows = [one for one in made if one["poses"] == n_poses]
+        low, high = (f"{end(one['circle, mean [mm]'] for one in rows):.2f}" for end in (min, max))
+        assert f"{minutes} {low} to {high}" in page
+        assert min(one["recording [min]"] for one in rows) > 5.9 and len(rows) == 6
+
+
 def readme_rows():
     """The table of README."""
     circle = (mean(arms, "with", "0 g", "rmse_mm") for arms in ("open", "rod"))
