@@ -21,6 +21,8 @@ import numpy as np
 from calib import demo
 from calib.fit.blocks import held_out_blocks
 from calib.fit.chambers import fit_chambers
+from calib.fit.motion.actuators import MEASURED, fit_regulator
+from calib.fit.motion.tracks import Runs, Track
 from calib.fit.s2r import fit_network
 from calib.fit.springs import fit_line, fit_springs
 from calib.read.logs import read_log
@@ -28,8 +30,11 @@ from calib.read.measurements import measure as measurements_of
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli
 from mjx_softarm.logs import checks
+from mjx_softarm.logs.schema import UNITS
 from mjx_softarm.sensing.s2r import correction
 
+PSI = UNITS["pressure"]["psi"]  # [kPa]
+ASU_PERIOD_S = 0.02
 ASU_LOGS = {name: f"asu_softarm/{name}_data_collect_1.txt" for name in ("apr5", "apr4")}
 TRUNK_LOG = "asl_trunk/observations_controlled_{}.csv"
 STILL_M, STILL_S = 2e-3, 0.5  # the wires lag motion capture by a tenth of a second
@@ -79,7 +84,7 @@ def _worst(fitted: Any, true: Any) -> float:
 
 
 def real_logs(data: Path) -> dict[str, Any]:
-    """Return errors [mm] of calibrated lines and of the sim-to-real network on logs of real arms."""
+    """Return errors of calibrated lines, the sim-to-real network and regulators on logs of real arms."""
     splits = {
         f"a fifth of the blocks, seed {seed}": trunk_errors(
             data, "1", functools.partial(held_out_blocks, seed=seed)
@@ -90,7 +95,38 @@ def real_logs(data: Path) -> dict[str, Any]:
     return {
         "draw wires to section length at rest, RMS": {name: wires_error(data, name) for name in ASU_LOGS},
         "trunk, 3D RMSE": [{"held out": name, **errors} for name, errors in splits.items()],
+        "pressures of another day, RMS [psi]": regulators_errors(data),
     }
+
+
+def regulators_errors(data: Path) -> dict[str, float]:
+    """Return errors [psi] of pressures by the commands of one day, by regulators fitted to the other day.
+
+    The chambers' volumes are not known and taken as constant. A prediction begins with the first measured
+    pressures and then sees the commands alone. Beside them stand the errors of the commands themselves.
+    """
+    tracks = {name: asu_track(data / path) for name, path in ASU_LOGS.items()}
+    days = {name: Runs([track], ASU_PERIOD_S) for name, track in tracks.items()}
+    found = {}
+    for fitted, asked in (tuple(ASU_LOGS), tuple(ASU_LOGS)[::-1]):
+        every = np.ones(days[fitted].n_seconds * days[fitted].n_chambers, bool)
+        regulator, lag_s, _ = fit_regulator(days[fitted], every, MEASURED, n_sections=2)
+        error = days[asked].errors(days[asked].simulated([regulator]), lag_s)
+        found[f"of {asked}, fitted to {fitted}"] = float(np.sqrt(np.nanmean((error / PSI) ** 2)))
+        off = (tracks[asked].commanded_kpa - tracks[asked].pressure_kpa) / PSI
+        found[f"of {asked}, the commands"] = float(np.sqrt(np.mean(off**2)))
+    return found
+
+
+def asu_track(path: Path) -> Track:
+    """Return commands and pressures of a log of ASU RISE at a steady rate; a command holds until the next."""
+    values = np.loadtxt(path, delimiter=",")
+    time_s, pressures = values[:, 0], PSI * values[:, 1:13]
+    desired, measured = pressures[:, [0, 1, 2, 6, 7, 8]], pressures[:, [3, 4, 5, 9, 10, 11]]
+    grid = np.arange(time_s[0], time_s[-1], ASU_PERIOD_S)
+    held = np.searchsorted(time_s, grid, side="right") - 1
+    followed = np.stack([np.interp(grid, time_s, column) for column in measured.T], axis=1)
+    return Track(desired[held], followed, np.ones_like(followed))
 
 
 def wires_error(data: Path, name: str) -> float:

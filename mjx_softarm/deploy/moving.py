@@ -62,7 +62,9 @@ class ShapeLag(NamedTuple):
             load_kg: payload.
             dt_s: time since the last lengths.
         """
-        # Difference at rest
+        # Difference at rest; without a lag it is that in motion, too
+        if not policy.spec.shape_lag_s:
+            return self, np.zeros(6)
         model = policy.estimator
         base = Frame(model.base_position_m, model.base_rotation)
         pose = estimate(model, spring_m, load_kg)
