@@ -61,6 +61,9 @@ TOLERANCES: dict[str, Any] = {"max_nfev": 60, "ftol": 1e-6, "xtol": 1e-3, "gtol"
 # Standard deviation of the logarithms of lag and dead time by the springs, beside that of the fit: the arm is
 # more than some lags. Planted lags of 0.5 and 0.8 s of rods came out 1 % above and 4 % below.
 BY_SPRINGS = 0.05
+# The same of the regulators' lag, as a share of the arm's own lag, which the springs show with it: 0.15 s came
+# out as 0.19 s beside an arm that lags by 0.25 s in stretching
+OF_ARM_LAG = 0.1
 # Error from which the actuators are of another kind: in the noise of the pressures, and at least
 MISFIT, SMALL_MISFIT_KPA = 4.0, 0.15
 # Greatest distance of a converged fit from its minimum, in standard deviations, RMS over the parameters; dead
@@ -157,17 +160,18 @@ def fit_actuators(
 
     # Put the better kind into the specification
     of_chambers = np.einsum("smr,mc->csr", errors[chosen][held_out].reshape(-1, c, runs.rows), runs.modes)
+    arm_lag_s = float(np.mean(kinds[chosen][1])) if by_springs else None
     done = ActuatorFit(
         spec=with_actuators(spec, kinds[chosen][0]),
         chosen=chosen,
-        half_width_95=_half_widths(regulator, solution, BY_SPRINGS if by_springs else 0.0),
+        half_width_95=_half_widths(regulator, solution, arm_lag_s),
         in_sample_rms_kpa=rms_of(errors[chosen][~held_out]),
         held_out_rms_kpa=rms,
         chamber_rms_kpa=np.array([rms_of(error) for error in of_chambers]),
         noise_kpa=runs.noise_kpa(),
         n_tracks=len(tracks),
         time_s=sum(len(track.pressure_kpa) for track in tracks) / spec.control.rate_hz,
-        arm_lag_s=float(np.mean(kinds[chosen][1])) if by_springs else None,
+        arm_lag_s=arm_lag_s,
     )
     return dataclasses.replace(done, warnings=_warnings(done, solution), notes=_notes(done))
 
@@ -314,16 +318,19 @@ def _plain(actuators: Actuators) -> dict[str, float | tuple[float, ...]]:
     return {name: tuple(map(float, x)) if np.ndim(x) else float(x) for name, x in values.items()}
 
 
-def _half_widths(regulator: Regulator, solution: Solution, log_std: float) -> dict[str, np.ndarray]:
+def _half_widths(regulator: Regulator, solution: Solution, arm_lag_s: float | None) -> dict[str, np.ndarray]:
     """Return the half-widths (c,) of the numbers of a regulator, of shared and own parameters together.
 
-    `log_std` is a further standard deviation of the logarithms of lag and dead time.
+    Lag and dead time by the springs of an arm, which lags itself, are less sure than the fit says.
     """
+    by_springs = {} if arm_lag_s is None else dict.fromkeys(_OWN[:2], BY_SPRINGS**2)
+    if arm_lag_s is not None:
+        by_springs["lag_s"] = BY_SPRINGS**2 + (OF_ARM_LAG * arm_lag_s / regulator.lag_s) ** 2
     c, n = np.size(regulator.offset_kpa), len(_SHARED) + 1
     covariance = solution.covariance
     widths = {}
     for k, name in enumerate(_SHARED):
-        variance = np.full(c, covariance[k, k]) + (log_std**2 if name in _OWN[:2] else 0.0)
+        variance = np.full(c, covariance[k, k]) + by_springs.get(name, 0.0)
         if name in _OWN:
             own = n + c + k * c + np.arange(c)
             variance = variance + covariance[own, own] + 2 * covariance[k, own]
