@@ -61,8 +61,8 @@ TOLERANCES: dict[str, Any] = {"max_nfev": 60, "ftol": 1e-6, "xtol": 1e-3, "gtol"
 # Standard deviation of the logarithms of lag and dead time by the springs, beside that of the fit: the arm is
 # more than some lags. Planted lags of 0.5 and 0.8 s of rods came out 1 % above and 4 % below.
 BY_SPRINGS = 0.05
-# The same of the regulators' lag, as a share of the arm's own lag: a lag of 0.15 s came out as 0.19 s beside an
-# arm that lags by 0.25 s in stretching
+# The same of the regulators' lag, as a share of the arm's own lag: a lag of 0.15 s came out as 0.19 s beside
+# an arm that lags by 0.25 s in stretching
 OF_ARM_LAG = 0.1
 # Error from which the actuators are of another kind: in the noise of the pressures, and at least
 MISFIT, SMALL_MISFIT_KPA = 4.0, 0.15
