@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import tyro
 from rich.console import Console
@@ -18,7 +18,7 @@ from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
 from train.agent.registry import LEARNERS, name_of
 from train.config import TrainConfig
-from train.presets import PRESETS
+from train.presets import PRESETS, preset_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +70,8 @@ class ReachOptions(NewRunOptions):
 
     preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
     """settings to begin with; the defaults below are this preset's"""
+    size: Literal["cpu", "gpu"] = "cpu"
+    """machine that the preset's numbers of arms, steps and transitions suit; gpu: of analytic and motion"""
     learner: Annotated[str, cli.one_of(n for n, e in LEARNERS.items() if not e.from_demonstrations)] = "tqc"
     """learner; where it is not the preset's, it begins with its own defaults"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -77,12 +79,13 @@ class ReachOptions(NewRunOptions):
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
         preset = named(arguments, "--preset", PRESETS, "quick")
-        config = PRESETS[preset]
+        size: Any = named(arguments, "--size", ("cpu", "gpu"), "cpu")
+        config = preset_of(preset, size)
         preset_learner = name_of(config.learner)
         learner = named(arguments, "--learner", LEARNERS, preset_learner)
         if learner != preset_learner:
             config = dataclasses.replace(config, learner=LEARNERS[learner].config())
-        return cls(preset=preset, learner=learner, config=config)
+        return cls(preset=preset, size=size, learner=learner, config=config)
 
 
 def _differing(one: Any, other: Any, ignored: Sequence[str] = ()) -> list[str]:

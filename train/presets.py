@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp.rewards import RewardConfig
 from train.agent.analytic import AnalyticConfig
@@ -116,6 +118,41 @@ PRESETS: dict[str, TrainConfig] = {
         env=dataclasses.replace(_MOVING, n_poses=16_384, randomisation=Randomisation(regulator_spread=0.2)),
     ),
 }
+
+# Settings of the learner and the environment for a GPU, as measured on an H200: docs/results/gpu.json
+GPU_SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "analytic": ({"n_arms": 1_024, "total_env_steps": 25_165_824}, {"n_poses": 131_072}),
+    "motion": (
+        {
+            "n_arms": 384,
+            "total_env_steps": 491_520,
+            "replay_capacity": 491_520,
+            "updates_per_env_step": 1 / 3,
+            "batch_size": 512,
+        },
+        {},
+    ),
+}
+
+
+def preset_of(name: str, size: str) -> TrainConfig:
+    """Return a preset for a CPU or a GPU.
+
+    Raises:
+        InputError: the preset has no size for a GPU.
+    """
+    config = PRESETS[name]
+    if size == "cpu":
+        return config
+    if name not in GPU_SIZES:
+        raise InputError(f"--size: got gpu with --preset {name}, expected one of {', '.join(GPU_SIZES)}")
+    learner, env = GPU_SIZES[name]
+    return dataclasses.replace(
+        config,
+        learner=dataclasses.replace(config.learner, **learner),
+        env=dataclasses.replace(config.env, **env),
+    )
+
 
 # The paper's schedules with a fifteenth or an eighth of its steps, which is enough. In the pipe, goals shift
 # to the worst with each fifth of the run. Of the circle's 16 points 8 come first, then all, the environment's

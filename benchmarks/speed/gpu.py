@@ -31,23 +31,11 @@ STEPS = {
     ("mjx", "dynamic"): (1024, 8192, 65_536),
     ("mjx-step", "dynamic"): (1024, 8192, 65_536),
 }
-# Presets, their seeds, and options that suit a GPU: more arms, larger batches and a larger pool of goals
+# Presets with their seeds, and options for a GPU
 TRAININGS = {
-    "quick": ("0", {}),
-    "analytic": (
-        "0,1",
-        {"learner.n-arms": 1024, "learner.total-env-steps": 25_165_824, "env.n-poses": 131_072},
-    ),
-    "motion": (
-        "0,1,2",
-        {
-            "learner.n-arms": 384,
-            "learner.total-env-steps": 491_520,
-            "learner.replay-capacity": 491_520,
-            "learner.updates-per-env-step": 1 / 3,
-            "learner.batch-size": 512,
-        },
-    ),
+    "quick": ("0", ()),
+    "analytic": ("0,1", ("--size", "gpu")),
+    "motion": ("0,1,2", ("--size", "gpu")),
 }
 
 
@@ -73,8 +61,7 @@ def training(preset: str, sweep: Path) -> list[dict[str, Any]]:
         InputError: the training failed.
     """
     seeds, options = TRAININGS[preset]
-    words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
-    asked = ("train", "sweep", "--preset", preset, "--seeds", seeds, *words, "--out", sweep)
+    asked = ("train", "sweep", "--preset", preset, "--seeds", seeds, *options, "--out", sweep)
     command(sweep.with_suffix(".log"), *asked, makes=sweep / "results.json")
     rows = []
     for run in open_members(sweep):

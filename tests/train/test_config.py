@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import pytest
 
@@ -9,7 +10,8 @@ from mjx_softarm._support.errors import InputError
 from train.agent.analytic import AnalyticConfig
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig, from_dict, override, to_dict
-from train.presets import IMITATION_PRESETS, PRESETS
+from train.options import ReachOptions
+from train.presets import GPU_SIZES, IMITATION_PRESETS, PRESETS
 
 
 def test_overrides_reach_every_level_and_leave_the_preset_alone():
@@ -98,3 +100,16 @@ def test_each_stages_end_is_evaluated(imitation_config):
     learner = dataclasses.replace(imitation_config.learner, total_env_steps=160)  # 10 epochs
     config = dataclasses.replace(imitation_config, learner=learner, evaluation_epochs=4)
     assert [epoch for epoch in range(1, 11) if config.evaluates_after(epoch)] == [4, 5, 8, 10]
+
+
+@pytest.mark.parametrize("preset", GPU_SIZES)
+def test_the_sizes_for_a_gpu_fit_each_other(preset):
+    learner: Any = ReachOptions.default(["--preset", preset, "--size=gpu"]).config.learner
+    assert learner.n_env_steps(learner.n_epochs) == learner.total_env_steps
+    if preset == "motion":
+        assert learner.n_updates_per_vector_step == 128
+
+
+def test_a_preset_without_a_size_for_a_gpu_says_which_have_one():
+    with pytest.raises(InputError, match="got gpu with --preset quick, expected one of analytic, motion"):
+        ReachOptions.default(["--preset", "quick", "--size", "gpu"])

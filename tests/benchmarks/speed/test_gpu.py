@@ -1,15 +1,12 @@
-"""The benchmark of a GPU: a training's times, sizes that fit, a row for each point."""
+"""The benchmark of a GPU: a training's times, a row for each point."""
 
 import json
-from typing import Any
 
 import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.harness import common
 from benchmarks.speed import gpu, throughput
-from train.config import override
-from train.presets import PRESETS
 
 
 def test_the_clock_of_a_training_runs_in_its_epochs():
@@ -21,23 +18,13 @@ def test_the_clock_of_a_training_runs_in_its_epochs():
     assert gpu.times_to(rows) == {"trained_s": 4.0, "to_5_mm_s": 3.0, "to_2_mm_s": 4.0, "to_1_mm_s": None}
 
 
-@pytest.mark.parametrize("preset", gpu.TRAININGS)
-def test_the_sizes_of_a_training_fit_each_other(preset):
-    _, options = gpu.TRAININGS[preset]
-    assignments = [f"{name.replace('-', '_')}={value}" for name, value in options.items()]
-    learner: Any = override(PRESETS[preset], assignments).learner
-    assert learner.n_env_steps(learner.n_epochs) == learner.total_env_steps
-    if preset == "motion":
-        assert learner.n_updates_per_vector_step == 128
-
-
 @pytest.mark.slow
 def test_smoke(tmp_path, monkeypatch):
     monkeypatch.setattr(common, "RESULTS", tmp_path)
     for module in (gpu, throughput):  # JAX has been used: no more devices
         monkeypatch.setattr(module, "mesh_of_cores", lambda n: None)
     monkeypatch.setattr(gpu, "STEPS", {("chain", "quasistatic"): (8,)})
-    tiny = {"learner.n-arms": 16, "learner.total-env-steps": 1024, "env.n-poses": 256}
+    tiny = ("--learner.n-arms", "16", "--learner.total-env-steps", "1024", "--env.n-poses", "256")
     monkeypatch.setattr(gpu, "TRAININGS", {"analytic": ("0,1", tiny)})
     assert main(["gpu", "--keep", str(tmp_path / "runs")]) == 0
     figures = json.loads((tmp_path / "gpu.json").read_text("utf-8"))["figures"]
