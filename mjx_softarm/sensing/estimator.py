@@ -84,11 +84,11 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     even = sections = arcs(length, bend)
 
     # Changes of each section's end; position and Gibbs vector are continuous where yaw and roll are not
-    load_kg = xp.asarray(load_kg, dtype=length.dtype)[..., None]
-    load_kg = xp.zeros_like(length[..., 0, :]) + load_kg  # (..., 1)
-    loads_kg = xp.zeros_like(length) + load_kg[..., None, :]
+    given_kg: Array = xp.asarray(load_kg, dtype=length.dtype)[..., None]
+    one_kg: Array = xp.zeros_like(length[..., 0, :]) + given_kg  # (..., 1)
+    loads_kg = xp.zeros_like(length) + one_kg[..., None, :]
     for _ in range(N_PASSES):
-        moments = first_moments(estimator, length, sections, load_kg)
+        moments = first_moments(estimator, length, sections, one_kg)
         ups = directions_up(estimator, sections)
         x = variables(length, bend, even.rotation, ups, moments, loads_kg)
         x = xp.clip((x - estimator.variable_centre) / estimator.variable_scale, -1.0, 1.0)

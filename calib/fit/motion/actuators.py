@@ -323,9 +323,10 @@ def _half_widths(regulator: Regulator, solution: Solution, arm_lag_s: float | No
 
     Lag and dead time by the springs of an arm, which lags itself, are less sure than the fit says.
     """
-    by_springs = {} if arm_lag_s is None else dict.fromkeys(_OWN[:2], BY_SPRINGS**2)
+    by_springs: dict[str, Any] = {}
     if arm_lag_s is not None:
-        by_springs["lag_s"] = BY_SPRINGS**2 + (OF_ARM_LAG * arm_lag_s / regulator.lag_s) ** 2
+        of_arm = OF_ARM_LAG * arm_lag_s / np.asarray(regulator.lag_s)
+        by_springs = {"lag_s": BY_SPRINGS**2 + of_arm**2, "dead_time_s": BY_SPRINGS**2}
     c, n = np.size(regulator.offset_kpa), len(_SHARED) + 1
     covariance = solution.covariance
     widths = {}
