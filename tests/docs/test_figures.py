@@ -144,23 +144,16 @@ def main_rows():
 
 def arm_rows():
     """The table *Kinds of arms*."""
-    for title, name, file in (
-        ("the paper's, 600 mm", "paper", "arms"),
-        ("`sopra`, 250 mm", "sopra", "arms"),
-        ("`stiff-flop`, 165 mm", "stiff-flop", "arms"),
-        ("`four-chamber`, 300 mm", "four-chamber", "arms"),
-        (
-            "the paper's at a tenth of its mass, upright ([`arms-upright.json`](results/arms-upright.json))",
-            "upright",
-            "arms-upright",
-        ),
-        (
-            "the paper's, in SoRoMoX ([`arms-soromox.json`](results/arms-soromox.json))",
-            "soromox",
-            "arms-soromox",
-        ),
+    made_of = {one["arm"]: one for one in figures("arms")["arms"]}
+    for title, name in (
+        ("the paper's, 600 mm", "paper"),
+        ("`sopra`, 250 mm", "sopra"),
+        ("`stiff-flop`, 165 mm", "stiff-flop"),
+        ("`four-chamber`, 300 mm", "four-chamber"),
+        ("the paper's at a tenth of its mass, upright", "upright"),
+        ("the paper's, in SoRoMoX", "soromox"),
     ):
-        made = figures(file)[name]
+        made = made_of[name]
         error, most, turn = (made[f"circle, {what}"] for what in ("mean [mm]", "largest [mm]", "mean [deg]"))
         digits = 2 if error < 1 else 1
         goals = f"{made['grid, measured']} of {made['grid, goals']}" + " goals" * (name == "paper")
