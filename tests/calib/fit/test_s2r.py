@@ -169,11 +169,11 @@ def test_held_out_rows_take_no_part_and_the_seed_decides(spec, arms):
 
 
 def test_warns_of_few_rows_no_gain_and_another_frame(spec, arms):
-    simulated, true = first(arms, 150), arms[1][:150]
+    simulated, true = first(arms, 50), arms[1][:50]
     perfect = fit_s2r(spec, simulated, simulated.pose, config=BRIEF).warnings
-    assert "got 150 rows" in perfect[0] and "no better than 0 without" in perfect[1]
-    turned = moved(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (150, 6)))
-    assert "in 150 of 150 rows" in fit_s2r(spec, simulated, turned, config=BRIEF).warnings[1]
+    assert "got 50 rows" in perfect[0] and "no better than 0 without" in perfect[1]
+    turned = moved(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (50, 6)))
+    assert "in 50 of 50 rows" in fit_s2r(spec, simulated, turned, config=BRIEF).warnings[1]
 
 
 def test_a_constant_input_and_a_constant_output_do_no_harm():
