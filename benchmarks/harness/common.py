@@ -66,8 +66,9 @@ def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
 
 
 def status_of(figures: Row) -> int:
-    """Return the exit status: 1 where a target is missed, else 0."""
-    return int(any(row["verdict"] == VERDICT[False] for row in figures.get("targets", ())))
+    """Return the exit status: 1 where a target is missed, or something `failed` to be measured, else 0."""
+    missed = any(row["verdict"] == VERDICT[False] for row in figures.get("targets", ()))
+    return int(missed or bool(figures.get("failed")))
 
 
 def grouped(rows: Iterable[Row], keys: Sequence[str]) -> dict[tuple[Any, ...], list[Row]]:

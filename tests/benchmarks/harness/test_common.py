@@ -36,3 +36,9 @@ def test_a_missed_target_ends_with_status_1_and_its_file_is_there(met, status, m
     figures = {"mm": 2.0, "targets": [target("1 mm", "0.5 mm", True), target("less", "2 mm", met)]}
     assert benchmarks._finish("settle", figures) == status
     assert json.loads((tmp_path / "settle.json").read_text())["figures"] == figures
+
+
+def test_a_missed_target_and_a_failure_are_told_by_the_exit_status():
+    met, missed = ({"targets": [common.target("a", "1", holds)]} for holds in (True, False))
+    statuses = [common.status_of(one) for one in (met, missed, met | {"failed": [{"contestant": "sbx"}]})]
+    assert statuses == [0, 1, 1]
