@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, Randomisation
@@ -13,7 +12,7 @@ from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.imitation import GoalStage, ImitationConfig
 from train.agent.tqc import TQCConfig
-from train.config import TrainConfig
+from train.config import TrainConfig, override
 
 # Settings that made learning faster or finer.
 _TUNED = TQCConfig(
@@ -119,18 +118,15 @@ PRESETS: dict[str, TrainConfig] = {
     ),
 }
 
-# Settings of the learner and the environment for a GPU, as measured on an H200: docs/results/gpu.json
-GPU_SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "analytic": ({"n_arms": 1_024, "total_env_steps": 25_165_824}, {"n_poses": 131_072}),
+# Settings that suit a GPU, as measured on an H200: docs/results/gpu.json
+GPU_SIZES = {
+    "analytic": ("learner.n_arms=1024", "learner.total_env_steps=25165824", "env.n_poses=131072"),
     "motion": (
-        {
-            "n_arms": 384,
-            "total_env_steps": 491_520,
-            "replay_capacity": 491_520,
-            "updates_per_env_step": 1 / 3,
-            "batch_size": 512,
-        },
-        {},
+        "learner.n_arms=384",
+        "learner.total_env_steps=491520",
+        "learner.replay_capacity=491520",
+        f"learner.updates_per_env_step={1 / 3}",
+        "learner.batch_size=512",
     ),
 }
 
@@ -141,17 +137,11 @@ def preset_of(name: str, size: str) -> TrainConfig:
     Raises:
         InputError: the preset has no size for a GPU.
     """
-    config = PRESETS[name]
     if size == "cpu":
-        return config
+        return PRESETS[name]
     if name not in GPU_SIZES:
         raise InputError(f"--size: got gpu with --preset {name}, expected one of {', '.join(GPU_SIZES)}")
-    learner, env = GPU_SIZES[name]
-    return dataclasses.replace(
-        config,
-        learner=dataclasses.replace(config.learner, **learner),
-        env=dataclasses.replace(config.env, **env),
-    )
+    return override(PRESETS[name], GPU_SIZES[name])
 
 
 # The paper's schedules with a fifteenth or an eighth of its steps, which is enough. In the pipe, goals shift

@@ -21,6 +21,7 @@ import numpy as np
 from calib import demo
 from calib.fit.blocks import held_out_blocks
 from calib.fit.chambers import fit_chambers
+from calib.fit.leastsquares import rms_of
 from calib.fit.motion.actuators import MEASURED, fit_regulator
 from calib.fit.motion.tracks import Runs, Track
 from calib.fit.s2r import fit_network
@@ -112,21 +113,20 @@ def regulators_errors(data: Path) -> dict[str, float]:
         every = np.ones(days[fitted].n_seconds * days[fitted].n_chambers, bool)
         regulator, lag_s, _ = fit_regulator(days[fitted], every, MEASURED, n_sections=2)
         error = days[asked].errors(days[asked].simulated([regulator]), lag_s)
-        found[f"of {asked}, fitted to {fitted}"] = float(np.sqrt(np.nanmean((error / PSI) ** 2)))
-        off = (tracks[asked].commanded_kpa - tracks[asked].pressure_kpa) / PSI
-        found[f"of {asked}, the commands"] = float(np.sqrt(np.mean(off**2)))
+        found[f"of {asked}, fitted to {fitted}"] = rms_of(error) / PSI
+        found[f"of {asked}, the commands"] = (
+            rms_of(tracks[asked].commanded_kpa - tracks[asked].pressure_kpa) / PSI
+        )
     return found
 
 
 def asu_track(path: Path) -> Track:
     """Return commands and pressures of a log of ASU RISE at a steady rate; a command holds until the next."""
-    values = np.loadtxt(path, delimiter=",")
-    time_s, pressures = values[:, 0], PSI * values[:, 1:13]
-    desired, measured = pressures[:, [0, 1, 2, 6, 7, 8]], pressures[:, [3, 4, 5, 9, 10, 11]]
-    grid = np.arange(time_s[0], time_s[-1], ASU_PERIOD_S)
-    held = np.searchsorted(time_s, grid, side="right") - 1
-    followed = np.stack([np.interp(grid, time_s, column) for column in measured.T], axis=1)
-    return Track(desired[held], followed, np.ones_like(followed))
+    log = read_asu(path)
+    grid = np.arange(log.time_s[0], log.time_s[-1], ASU_PERIOD_S)
+    held = np.searchsorted(log.time_s, grid, side="right") - 1
+    followed = np.stack([np.interp(grid, log.time_s, column) for column in log.pressure_kpa.T], axis=1)
+    return Track(log.commanded_kpa[held], followed, np.ones_like(followed))
 
 
 def wires_error(data: Path, name: str) -> float:
@@ -206,11 +206,13 @@ def polynomial(x: np.ndarray, y: np.ndarray, train: np.ndarray, degree: int) -> 
 
 
 class AsuLog(NamedTuple):
-    """First section of the two-section pneumatic arm of ASU RISE."""
+    """The two-section pneumatic arm of ASU RISE."""
 
     time_s: np.ndarray  # (n,)
-    wire_m: np.ndarray  # (n,) mean of its two draw wires, from the base
-    section_m: np.ndarray  # (n,) from its base to its end
+    commanded_kpa: np.ndarray  # (n, 6) of both sections
+    pressure_kpa: np.ndarray  # (n, 6) measured
+    wire_m: np.ndarray  # (n,) mean of the first section's two draw wires, from the base
+    section_m: np.ndarray  # (n,) from the first section's base to its end
     fresh: np.ndarray  # (n,) whether every body has moved since the row before
 
 
@@ -232,8 +234,14 @@ def read_asu(path: Path) -> AsuLog:
     base, middle, tip = np.split(values[:, 17:], 3, axis=1)
     section_m = np.linalg.norm((middle - base)[:, :3], axis=1)
     stale = [checks.stale_rows(body) for body in (base, middle, tip)]
+    kpa = PSI * values[:, 1:13].reshape(-1, 2, 2, 3)  # section, desired or measured, chamber
     return AsuLog(
-        values[:, 0], WIRE_M_PER_V * values[:, 13:15].mean(axis=1), section_m, ~np.any(stale, axis=0)
+        time_s=values[:, 0],
+        commanded_kpa=kpa[:, :, 0].reshape(-1, 6),
+        pressure_kpa=kpa[:, :, 1].reshape(-1, 6),
+        wire_m=WIRE_M_PER_V * values[:, 13:15].mean(axis=1),
+        section_m=section_m,
+        fresh=~np.any(stale, axis=0),
     )
 
 

@@ -28,6 +28,7 @@ import numpy as np
 from benchmarks.harness.common import RESULTS, cpu_kind, show
 from benchmarks.harness.rounds import ROOT
 from benchmarks.speed.truth import random_references, settle_function
+from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -139,7 +140,8 @@ def measure_costs() -> dict[str, float]:
     # Compile its epoch, and prepare the other work, whose first calls do not count.
     compiling_s = [_seconds(compile_epoch) for _ in range(SIZES["n_compiles"])]
     matrix = np.random.default_rng(0).normal(size=(SIZES["n_rows"],) * 2).astype(np.float32)
-    solve, references = settle_function(env.spec), random_references(env.spec, n_arms).astype(np.float32)
+    solve = xla.jit(settle_function(env.spec))
+    references = random_references(env.spec, n_arms).astype(np.float32)
     work = {
         "product": lambda: [matrix @ matrix for _ in range(SIZES["n_products"])],
         "settle": lambda: [solve(references) for _ in range(SIZES["n_settles"])],

@@ -64,6 +64,20 @@ def spread(mesh: Mesh | None) -> NamedSharding | None:
     return NamedSharding(mesh, PartitionSpec(mesh.axis_names)) if mesh else None
 
 
+def of_shares(function: Callable, mesh: Mesh | None, axis: int = 0) -> Callable:
+    """Return a function of arms of which each device computes its share, and waits for no other's arms.
+
+    Args:
+        function: of arrays whose first axis is that of the arms.
+        mesh: devices; None for one.
+        axis: axis of the arms in its results.
+    """
+    if mesh is None:
+        return function
+    arms, results = PartitionSpec(mesh.axis_names), PartitionSpec(*[None] * axis, mesh.axis_names)
+    return jax.shard_map(function, mesh=mesh, in_specs=arms, out_specs=results, check_vma=False)
+
+
 @functools.cache
 def _make_devices() -> None:
     jax.config.update("jax_num_cpu_devices", n_cores())
@@ -94,29 +108,30 @@ def rollout(engine: Any, mode: Any, n: int, mesh: Mesh | None = None) -> Program
     """
     n_steps = N_STEPS[mode] if n <= N_FEW else 1
     env = ReachEnv(config=EnvConfig(engine=engine, mode=mode, n_poses=N_POSES))
-    arms = VectorEnv(env, n, EPISODE_LENGTH, mesh)
+    n_devices = mesh.size if mesh else 1
+    arms = VectorEnv(env, n // n_devices, EPISODE_LENGTH)  # of a device
 
-    def run(state: Any, key: jax.Array) -> Any:
+    def run(state: Any, keys: jax.Array) -> Any:
         def step(state: Any, key: jax.Array) -> Any:
             key_action, key_reset = jax.random.split(key)
-            action = draws.uniform(key_action, (n, env.action_size), minval=-1.0)
+            action = draws.uniform(key_action, (arms.n, env.action_size), minval=-1.0)
             following, after, _ = arms.step(state, action, key_reset)
             ends = env.reference_m(action), after.pipeline_state.pose[:, :3]
             return following, (after.metrics["unsettled"], after.metrics["saturated_chambers"], *ends)
 
-        with draws.on(mesh):
-            return jax.lax.scan(step, state, jax.random.split(key, n_steps))[1]
+        return jax.lax.scan(step, state, jax.random.split(keys[0], n_steps))[1]
 
     # Reset some arms, and repeat them
     few = VectorEnv(env, min(n, N_STARTS), EPISODE_LENGTH)
     state = xla.jit(few.reset, "once")(jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.resize(x, (n, *x.shape[1:])), jax.device_get(state))
-    state = jax.device_put(state, spread(mesh))
+    keys = jax.random.split(jax.random.PRNGKey(1), n_devices)
+    state, keys = jax.device_put((state, keys), spread(mesh))
     # Compile
-    start, key = time.perf_counter(), jax.random.PRNGKey(1)
-    compiled = xla.jit(run).lower(state, key).compile()
+    start = time.perf_counter()
+    compiled = xla.jit(of_shares(run, mesh, axis=1)).lower(state, keys).compile()
     compile_s = time.perf_counter() - start
-    return Program(compile_s, lambda: compiled(state, key), n_steps * n)
+    return Program(compile_s, lambda: compiled(state, keys), n_steps * n)
 
 
 def training(config: TrainConfig) -> Program:

@@ -16,9 +16,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from benchmarks.harness.common import n_cores
-from benchmarks.speed.jax_worker import Program, digits, mesh_of_cores, rates, spread
+from benchmarks.speed.jax_worker import Program, digits, mesh_of_cores, of_shares, rates, spread
 from benchmarks.speed.mujoco_arms import SteppedArms
 from benchmarks.speed.truth import Truth, error_figures, random_references, settle_function, true_rest
+from mjx_softarm._support import xla
 from mjx_softarm.spec import ArmSpec
 
 LINKS = (2, 4, 10)  # per section
@@ -67,6 +68,6 @@ def methods_rows(links: int, mesh: Mesh | None) -> list[dict[str, Any]]:
 
 def _solver(spec: ArmSpec, engine: str, reference_m: np.ndarray, mesh: Mesh | None) -> Callable[[], Any]:
     """Return a function that settles references (n, n_springs) [m] and returns tips (n, 3) [m]."""
-    solve = settle_function(spec, engine, mesh=mesh)
+    solve = xla.jit(of_shares(settle_function(spec, engine), mesh))
     placed = jax.device_put(reference_m.astype(np.float32), spread(mesh))
     return lambda: solve(placed).tip_position_m

@@ -12,11 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.lazy import put
-from mjx_softarm.env.vector import over_arms
 from mjx_softarm.mechanics import settle as solver
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.mjx_rest import measured
@@ -35,10 +33,8 @@ class Truth(NamedTuple):
     share_at_limit: float  # of the chambers
 
 
-def settle_function(
-    spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32, mesh: Mesh | None = None
-) -> Callable:
-    """Return a jitted function, references (n, n_springs) -> `Settled`, spread over a mesh of devices."""
+def settle_function(spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32) -> Callable:
+    """Return a function to be jitted, references (n, n_springs) -> `Settled`."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
     n_at_once = solver.arms_at_once(spec.n_links)
     model, data = put(build_model(spec)) if engine == "mjx" else (None, None)
@@ -47,13 +43,13 @@ def settle_function(
         proposed = solver.settle(params, reference_m, n_at_once)
         return proposed if model is None else measured(model, data, params, proposed)
 
-    return xla.jit(over_arms(at_rest, mesh))
+    return jax.vmap(at_rest)
 
 
 def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
     """Return the equilibria of arms under the control law, at references (n, n_springs) [m]."""
     with jax.enable_x64(True):
-        solve = settle_function(spec, dtype=np.float64)
+        solve = xla.jit(settle_function(spec, dtype=np.float64))
         solution = jax.device_get(solve(jnp.asarray(reference_m, np.float64)))
     share_at_limit = float(np.mean(solution.at_limit[solution.settled]))
     return Truth(1e3 * solution.tip_position_m, solution.settled, share_at_limit)

@@ -62,9 +62,10 @@ class ShapeLag(NamedTuple):
             load_kg: payload.
             dt_s: time since the last lengths.
         """
-        # Difference at rest; without a lag it is that in motion, too
+        # A shape without a lag is always that at rest
         if not policy.spec.shape_lag_s:
             return self, np.zeros(6)
+        # Difference at rest
         model = policy.estimator
         base = Frame(model.base_position_m, model.base_rotation)
         pose = estimate(model, spring_m, load_kg)

@@ -247,7 +247,7 @@ class _Body:
         n = places.shape[-1]
         rows = flat.reshape(-1, n)
         within = rows[0] - start
-        if len(rows) > 1 < n and np.array_equal(rows, rows[:, :1] + within):
+        if min(len(rows), n) > 1 and np.array_equal(rows, rows[:, :1] + within):
             row = self._places(places[..., 0], f"({_one(i)} / {n})")
             return f"{_one(row)} + {_one(self._places(within, f'({_one(i)} % {n})'))}"
         return f"{self._numbers.name(flat.astype(np.int32))}[{i}]"

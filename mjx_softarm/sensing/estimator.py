@@ -109,7 +109,7 @@ def _change(estimator: PoseEstimator, x: Array) -> Array:
     xp = array_namespace(x)
     # Terms come first: NumPy gathers whole rows of a batch nine times as fast as single numbers
     terms = polynomial_terms(xp.swapaxes(x.reshape(-1, *x.shape[-2:]), 0, 2))  # (N_TERMS, n_sections, batch)
-    change = xp.swapaxes(xp.asarray(estimator.coefficient), 1, 2) @ xp.swapaxes(terms, 0, 1)
+    change = xp.swapaxes(estimator.coefficient, 1, 2) @ xp.swapaxes(terms, 0, 1)
     change = xp.swapaxes(xp.swapaxes(change, 0, 2), 1, 2)  # (batch, n_sections, N_CHANGES)
     return change.reshape(*x.shape[:-1], N_CHANGES)
 

@@ -1,10 +1,10 @@
-"""Numbers in the tables of README and Results are those of the files under `docs/results`."""
+"""Numbers in tables of README and the pages are those of the files under `docs/results`."""
 
 import functools
 import json
 import re
 from pathlib import Path
-from statistics import fmean, pstdev
+from statistics import fmean, median, pstdev
 
 import pytest
 
@@ -13,8 +13,12 @@ ANGLES = "yaw_deg", "pitch_deg", "roll_deg"
 
 
 @functools.cache
+def stored(name):
+    return json.loads((ROOT / f"docs/results/{name}.json").read_text("utf-8"))
+
+
 def figures(name):
-    return json.loads((ROOT / f"docs/results/{name}.json").read_text("utf-8"))["figures"]
+    return stored(name)["figures"]
 
 
 def runs(arms, kind, variant):
@@ -133,13 +137,88 @@ def main_rows():
     here = f"{analytic['median_mm']:.2f}, {analytic['p95_mm']:.2f} mm"
     title = "[In simulation](#held-out-goals): median, 95 %"
     yield row(title, here, "RMSE 3.89 mm, the paper's simulated circle")
-    steps = {
-        one["engine"]: f"{one['env_steps_per_s']:,}"
-        for one in json.loads((ROOT / "docs/results/throughput.json").read_text("utf-8"))["rows"]
-        if (one["mode"], one["arms"]) == ("quasistatic", 1024)
-    }
-    here = f"{steps['mjx']} in MJX, {steps['chain']} in closed form"
+    here = f"{env_steps('mjx')} in MJX, {env_steps('chain')} in closed form"
     yield row("[Env steps/s](speed.md#env-steps), two CPU cores", here, "the paper at most 467")
+    shares = [100 * one["circle, mean [mm]"] / one["length [mm]"] for one in figures("arms")["arms"]]
+    *kinds, soromox = shares
+    here = f"{min(kinds):.2f} to {max(kinds):.2f} % of the arm's length"
+    yield row("[Kinds of arms](trust.md#kinds-of-arms): circle", here, "target 0.5 %")
+    title = "[An arm in SoRoMoX](trust.md#kinds-of-arms), an independent library: circle"
+    yield row(title, f"{soromox:.2f} % of its length", "target 0.5 %")
+    sixty = [one["circle, mean [mm]"] for one in figures("arms-minutes")["arms"] if one["poses"] == 60]
+    title = "[Ten minutes recorded](trust.md#minutes-of-recording), not 500 poses: circle"
+    yield row(title, f"at most {max(sixty):.2f} mm", "target 1.5 mm")
+    quick, sbx, sb3 = (f"{median(race(name, 'to_5_mm')):.0f} s" for name in RACED)
+    here = f"TQC (`quick`) {quick}, `analytic` {max(race('ours-analytic', 'to_5_mm')):.0f} s"
+    yield row("[Learning](speed.md#time-to-learn) to 5 mm", here, f"SBX {sbx}, sb3-contrib {sb3}")
+
+
+RACED = {
+    "ours-quick": "`quick`",
+    "sbx-hindsight": "SBX, `quick`'s settings, own hindsight",
+    "sb3-contrib-hindsight": "sb3-contrib, in the same way",
+}
+
+
+def race(contestant, name):
+    """A contestant's numbers, without those of seeds that did not come so far."""
+    rows = [one[name] for one in figures("race")["wall_s"] if one["contestant"] == contestant]
+    return [x for x in rows if not isinstance(x, str)]
+
+
+def race_rows():
+    """The table *Time to learn*; the gradient learner is at 1.5 mm by its first evaluation."""
+    for name, title in RACED.items():
+        cells = [f"{median(race(name, 'start_up_s')):.0f}"]
+        for level in ("to_5_mm", "to_3_mm", "to_2_mm"):
+            times = race(name, level)
+            cells.append(f"{median(times):.0f} ({min(times):.0f} to {max(times):.0f})")
+        once = race(name, "to_1_mm")
+        cells.append(f"{once[0]:.0f}, one seed" if once else "")
+        yield re.sub("  +", " ", row(title, *cells, f"{median(race(name, 'best_mm')):.2f}"))
+    times, best = race("ours-analytic", "to_1_mm"), race("ours-analytic", "best_mm")
+    first = f"within {max(race('ours-analytic', 'to_2_mm')):.0f}"
+    once = f"{median(times):.0f} ({min(times):.0f} to {max(times):.0f})"
+    start = f"{median(race('ours-analytic', 'start_up_s')):.0f}"
+    yield row("`analytic`", start, first, first, first, once, f"{median(best):.2f}")
+
+
+def env_steps(engine, mode="quasistatic", n_arms=1024):
+    [found] = [
+        one["env_steps_per_s"]
+        for one in stored("throughput")["rows"]
+        if (one["engine"], one["mode"], one["arms"]) == (engine, mode, n_arms)
+    ]
+    return f"{found:,}"
+
+
+def step_rows():
+    """The table *Env steps*."""
+    for n in (64, 1024, 8192):
+        cells = (("chain", "quasistatic"), ("mjx", "quasistatic"), ("mjx", "dynamic"))
+        yield row(f"{n:,}", *(env_steps(*cell, n) for cell in cells))
+
+
+def gpu_rows():
+    """The table *On a GPU*. In its file our step in motion is called chain, and `mjx.step` mjx."""
+    points = figures("gpu")["env_steps"]
+    rates = {(one["engine"], one["mode"], one["arms"]): one.get("env_steps_per_s") for one in points}
+    cells = ("chain", "quasistatic"), ("mjx", "quasistatic"), ("chain", "dynamic"), ("mjx", "dynamic")
+    for n in (1024, 8192):
+        yield row(f"{n:,}", *(f"{rates[*cell, n]:,}" for cell in cells))
+    chain, moving = (rates[*cells[k], 65_536] for k in (0, 2))
+    yield f"| 65,536 | {chain:,} | | {moving:,} | |"
+
+
+def test_solves_per_second_are_those_of_the_file():
+    rates = {
+        (one["links_per_section"], one["method"]): one.get("solves_per_s")
+        for one in figures("settle")["over_links"]
+    }
+    page = (ROOT / "docs/settling.md").read_text("utf-8").splitlines()
+    for links in (2, 4):
+        cells = (f"{rates[links, method]:,.0f}" for method in ("chain", "mjx", "stepping"))
+        assert row(f"{links}", *cells) in page
 
 
 def arm_rows():
@@ -185,6 +264,7 @@ def readme_rows():
 TABLES = {
     "docs/results.md": (main_rows, circle_rows, load_rows, lap_rows, pipe_rows, held_out_rows),
     "docs/trust.md": (arm_rows,),
+    "docs/speed.md": (race_rows, step_rows, gpu_rows),
     "README.md": (readme_rows,),
 }
 

@@ -74,11 +74,11 @@ N_SINGLE = 200  # single rows of the fixture `golden`, a fifth of an export's
 
 
 @contextlib.contextmanager
-def few_golden_rows(run_ticks=30):
+def few_golden_rows(run_ticks=30, n_single=40, n_checked=4, n_candidates=30):
     """Golden rows made in here are few; runs end after so many ticks."""
-    few = {"N_SINGLE": 40, "N_CHECKED": 4, "_CANDIDATES": 30, "_RUN_TICKS": run_ticks}
+    numbers = {"N_SINGLE": n_single, "N_CHECKED": n_checked, "_CANDIDATES": n_candidates}
     with pytest.MonkeyPatch.context() as patch:
-        for name, number in few.items():
+        for name, number in (numbers | {"_RUN_TICKS": run_ticks}).items():
             patch.setattr(golden_rows, name, number)
         yield
 
@@ -98,9 +98,7 @@ def controller(policy_file):
 
 @pytest.fixture(scope="session")
 def golden(controller, policy_file):
-    """Rows of all kinds and faults, fewer than an export has."""
-    few = {"N_SINGLE": N_SINGLE, "N_CHECKED": 24, "_CANDIDATES": 110}
-    with pytest.MonkeyPatch.context() as patch:
-        for name, number in few.items():
-            patch.setattr(golden_rows, name, number)
-        return golden_rows.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())
+    """Rows of all kinds and faults, fewer than an export has; the runs are as long."""
+    sha256 = hashlib.sha256(policy_file.read_bytes()).hexdigest()
+    with few_golden_rows(golden_rows._RUN_TICKS, N_SINGLE, n_checked=24, n_candidates=110):
+        return golden_rows.make_golden(controller, sha256)

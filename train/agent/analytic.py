@@ -36,7 +36,7 @@ from mjx_softarm._support.errors import check_settings
 from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
-from mjx_softarm.env.vector import VectorEnv, choose_arms, over_arms
+from mjx_softarm.env.vector import VectorEnv, choose_arms
 from mjx_softarm.mdp import rewards
 from train.agent.learner import LearnerConfig
 from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
@@ -209,7 +209,7 @@ class GradientEpoch:
         """Take one gradient step, and one action of all arms."""
         key, key_arms = jax.random.split(state.key)
         # Act H times, and differentiate each arm's loss by each of its actions.
-        look_ahead = over_arms(jax.value_and_grad(self._loss, has_aux=True), n_shared=1)
+        look_ahead = jax.vmap(jax.value_and_grad(self._loss, has_aux=True), in_axes=(0, 0, None))
         changes = jnp.zeros((self.arms.n, self.config.horizon, self.env.action_size))
         ahead: _Ahead
         d_action: Array  # (B, H, A)
