@@ -42,7 +42,7 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
 
 AT_LIMIT_KPA = 0.2  # distance to a limit at which a measured, noisy pressure counts as at it
-TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference; a run may set another
+TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference
 YIELD_M_PER_KPA = 1e-4  # length error that a chamber accepts for 1 kPa of redundant pressure less
 
 

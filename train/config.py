@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.fields import Count, Number, check_ranges
 from mjx_softarm.env import EnvConfig
 from train.agent.learner import LearnerConfig
 from train.agent.registry import LEARNERS, name_of
@@ -22,19 +23,17 @@ class TrainConfig:
 
     learner: LearnerConfig = field(default_factory=TQCConfig)
     """settings of the learner"""
-    seed: int = 0
+    seed: Number = 0
     """seed of networks, exploration, goals, batches, and of poses that are drawn anew"""
-    evaluation_epochs: int = 10
+    evaluation_epochs: Count = 10
     """epochs between two evaluations and checkpoints"""
-    fresh_poses_epochs: int = 0
+    fresh_poses_epochs: Number = 0
     """epochs after which other poses take the place of env.n_poses, for starts and goals; 0: never"""
     env: EnvConfig = field(default_factory=EnvConfig)
     """environment"""
 
     def __post_init__(self) -> None:
-        for name, low in {"seed": 0, "evaluation_epochs": 1, "fresh_poses_epochs": 0}.items():
-            if getattr(self, name) < low:
-                raise InputError(f"{name}: got {getattr(self, name)}, expected at least {low}")
+        check_ranges("train", self)
         given_kg = self.env.randomisation.payload_max_kg
         if self.env.observation == "payload" and given_kg is not None:
             raise InputError(

@@ -58,7 +58,7 @@ class PressureEnv(ReachEnv):
         low, high = params.pressure_min_kpa, params.pressure_max_kpa
         pressure_kpa = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
         held = settle_pressures(params, pressure_kpa, self.n_at_once)
-        return super().step(state, self.action_of(held.spring_m + arm.sensor_offset_m))
+        return super().step(state, self.action_of(held.spring_m))
 
 
 class Commands(NamedTuple):

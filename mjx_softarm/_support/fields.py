@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import typing
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from mjx_softarm._support.errors import InputError
 
@@ -28,6 +29,7 @@ class Rule:
     low: float = -math.inf
     high: float = math.inf
     low_open: bool = False
+    high_open: bool = False
     per: str = ""  # parts that may have a number each, such as "chambers"
     length: int | None = None  # length of a field that must be a list; 0: one number for each part
     why: str = ""  # reason for the lower bound
@@ -39,7 +41,8 @@ class Rule:
         noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
         low += f" ({self.why})" if self.why else ""
-        high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
+        below = "<" if self.high_open else "<="
+        high = "" if self.high == math.inf else f"{' and' if low else ''} {below} {self.high:g}"
         high += f" ({self.unit})" if self.unit else ""
         if self.length is not None:
             return f"a list of {self.length} numbers" if self.length else "a list of numbers"
@@ -57,7 +60,48 @@ class Rule:
         except OverflowError:
             return False
         above = value > self.low if self.low_open else value >= self.low
-        return math.isfinite(value) and above and value <= self.high
+        below = value < self.high if self.high_open else value <= self.high
+        return math.isfinite(value) and above and below
+
+
+# Types of settings with their ranges, for `check_ranges`
+Count = Annotated[int, Rule(kind=int, low=1)]
+Number = Annotated[int, Rule(kind=int, low=0)]
+Amount = Annotated[float, Rule(low=0.0)]
+Positive = Annotated[float, Rule(low=0.0, low_open=True)]
+Share = Annotated[float, Rule(low=0.0, high=1.0)]
+PartialShare = Annotated[float, Rule(low=0.0, high=1.0, high_open=True)]
+PositiveShare = Annotated[float, Rule(low=0.0, high=1.0, low_open=True)]
+
+
+def check_ranges(where: str, settings: Any) -> None:
+    """Refuse a setting of a dataclass outside the range, or the names, of its type.
+
+    Args:
+        where: path or class of the settings, for the message.
+        settings: dataclass whose fields have types such as `Count` or `Literal`; None has no range.
+
+    Raises:
+        InputError: a setting is outside.
+    """
+    hints = typing.get_type_hints(type(settings), include_extras=True)
+    for item in fields(settings):
+        value = getattr(settings, item.name)
+        for accepts, expected in [] if value is None else _expectations(hints[item.name]):
+            if not accepts(value):
+                raise InputError(f"{where}.{item.name}: got {value!r}, expected {expected}")
+
+
+def _expectations(hint: Any) -> Iterator[tuple[Callable[[Any], bool], str]]:
+    """Yield what a type asks of a value: a test, and the test in words."""
+    if get_origin(hint) is Literal:
+        names = get_args(hint)
+        yield names.__contains__, f"one of {names}"
+    elif isinstance(hint, Rule):
+        yield hint.accepts, hint.text
+    elif get_origin(hint) is Annotated or type(None) in get_args(hint):
+        for part in get_args(hint):
+            yield from _expectations(part)
 
 
 def positive(per: str = "", high: float = math.inf, unit: str = "") -> Any:

@@ -42,6 +42,9 @@ from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.spec import ArmSpec
 
+POOL_SEED = 0  # of the poses that starts and goals are drawn from; not that of held-out ones
+CLEARANCE_MARGIN_MM = 10.0  # clearance of the body to the wall from which there is no cost
+
 
 class PosePool:
     """Poses of the workspace, a share of them uniform in volume; they are settled at the first use.
@@ -57,7 +60,7 @@ class PosePool:
 
     def __init__(self, spec: ArmSpec, config: EnvConfig, observed: Callable[[Array, Array], Array]):
         self._spec, self._config, self._observed = spec, config, observed
-        self._settled = functools.cache(lambda: self.draw(config.workspace_seed))
+        self._settled = functools.cache(lambda: self.draw(POOL_SEED))
         self._given = ContextVar[Pool | None]("pool", default=None)
         sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
         shapes: Any = (jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes)
@@ -212,8 +215,7 @@ class ReachEnv(brax_envs.Env):
         """Draw the random numbers of n episodes: leaves (n, ...)."""
         key, shape = jax.random.fold_in(rng, 1), (n, self.episode_motion.n_draws)
         moving = draws.uniform(key, shape) if self.config.moves else None
-        shapes = (n, 3 + self.spec.n_chambers), (n, self.spec.n_springs)
-        return EpisodeNoise(*draws.both(rng, *shapes), moving)
+        return EpisodeNoise(draws.uniform(rng, (n, 3 + self.spec.n_chambers)), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
         """Start the episode that `noise` fixes."""
@@ -228,7 +230,6 @@ class ReachEnv(brax_envs.Env):
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],
             chamber_stiffness=self.params.stiffened(factor).chamber_stiffness,
-            sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
             moving=self.episode_motion.params(noise.moving),
             **self.episode_motion.at_rest(start),
             sensed=None,
@@ -252,7 +253,7 @@ class ReachEnv(brax_envs.Env):
     def put(self, arm: ArmState, equilibrium: Pool) -> ArmState:
         """Return an arm at rest at an equilibrium, a row of a pool."""
         arm = arm._replace(**self.episode_motion.at_rest(equilibrium))
-        return arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m + arm.sensor_offset_m)))
+        return arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m)))
 
     def step(self, state: State, action: Array) -> State:
         """Move to the references of `action` (n_springs,) in [-1, 1]; `done` is 1 where the goal is reached.
@@ -262,8 +263,8 @@ class ReachEnv(brax_envs.Env):
         """
         # Move; a NaN in the action would ask for a length of 0
         arm: ArmState = state.pipeline_state
-        reference = self.reference_m(action)
-        motion, end = self._move(arm, reference - arm.sensor_offset_m)
+        reference_m = self.reference_m(action)
+        motion, end = self._move(arm, reference_m)
         result = jnp.where(jnp.all(jnp.isfinite(action)), end.result, self._results.NOT_FINITE.value)
         valid = result == 0
 
@@ -279,9 +280,9 @@ class ReachEnv(brax_envs.Env):
         arm = jax.tree.map(lambda new, old: jnp.where(valid, new, old), next_arm, arm)
 
         # Saturation, by the law's integral: in motion a pressure may be at a limit for a moment
-        tolerance, reading = 1e-3 * self.config.saturation_tolerance_mm, arm.spring_m + arm.sensor_offset_m
         held_kpa = arm.motion.law.integral_kpa
-        saturated = control.saturated(held_kpa, reference, reading, self.gains, tolerance) & valid
+        off = control.saturated(held_kpa, reference_m, arm.spring_m, self.gains, control.TOLERANCE_M)
+        saturated = off & valid
         blocked = jnp.any(saturated)
 
         # Reward
@@ -358,7 +359,7 @@ class ReachEnv(brax_envs.Env):
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
         """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""
-        within_mm = jnp.maximum(self.config.clearance_margin_mm - clearance_mm, 0.0)
+        within_mm = jnp.maximum(CLEARANCE_MARGIN_MM - clearance_mm, 0.0)
         return self.config.clearance_cost_per_mm * within_mm
 
     def observe(self, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
@@ -377,9 +378,8 @@ class ReachEnv(brax_envs.Env):
             before = max(self.n_ticks - obs.rate_ticks(self.spec.control.rate_hz), 0)
             last_m, tip_mm = end.path.spring_m[before], 1e3 * end.tip_position_m
             last_mm = 1e3 * end.path.tip_position_m[before]
-        read_m, last_m = arm.spring_m + arm.sensor_offset_m, last_m + arm.sensor_offset_m
         held_kpa = arm.motion.law.integral_kpa
-        return obs.observe_motion(read_m, last_m, tip_mm, last_mm, held_kpa, action, self.spec)
+        return obs.observe_motion(arm.spring_m, last_m, tip_mm, last_mm, held_kpa, action, self.spec)
 
     def params_of(self, arm: ArmState) -> ArmParams:
         """Return the parameters of an arm, with those of its episode in their places."""

@@ -30,7 +30,6 @@ class EpisodeNoise(NamedTuple):
     """Random numbers that fix one episode."""
 
     uniform: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
-    normal: Array  # (n_springs,) standard normal: bias of each spring's reading
     moving: Array | None  # (EpisodeMotion.n_draws,) from 0 to 1; None for arms at rest
 
 
@@ -39,7 +38,6 @@ class ArmState(NamedTuple):
 
     payload_kg: Array  # () payload of this episode
     chamber_stiffness: Array  # (n_chambers,) [N/m] stiffnesses of this episode
-    sensor_offset_m: Array  # (n_springs,) error of each spring's reading in this episode
     moving: MotionParams  # parameters of motion in this episode
     motion: Motion  # joint coordinates, velocities, pressures
     pose: Array  # (6,) [mm, deg] observed pose: the real arm's if there is a sim-to-real network

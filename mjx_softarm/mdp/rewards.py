@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mjx_softarm._support.fields import Amount
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.pose import pose_error, pose_from_frame
 
@@ -26,14 +27,14 @@ from mjx_softarm.sensing.pose import pose_error, pose_from_frame
 class RewardConfig:
     """Weights of the reward; `threshold` is the paper's theta, about 5.4 mm without a rotation error."""
 
-    goal_bonus: float = 100.0  # reward of a goal that is reached
-    error_cost: float = 10.0  # cost of a weighted error of 1
-    step_cost: float = 0.1  # cost of each action of the episode so far
-    saturation_cost: float = 100.0  # cost of a saturated chamber
-    threshold: float = 0.03  # weighted error below which a goal is reached
-    weight_per_mm: float = 0.0056  # weight of the tip's position
-    weight_per_deg: float = 0.001  # weight of the tip's angles
-    distance_cost: float = 0.0  # cost of a weighted error of 1, in every case
+    goal_bonus: Amount = 100.0  # reward of a goal that is reached
+    error_cost: Amount = 10.0  # cost of a weighted error of 1
+    step_cost: Amount = 0.1  # cost of each action of the episode so far
+    saturation_cost: Amount = 100.0  # cost of a saturated chamber
+    threshold: Amount = 0.03  # weighted error below which a goal is reached
+    weight_per_mm: Amount = 0.0056  # weight of the tip's position
+    weight_per_deg: Amount = 0.001  # weight of the tip's angles
+    distance_cost: Amount = 0.0  # cost of a weighted error of 1, in every case
     axes: tuple[float, ...] = (1.0,) * 6
     """factors of the weights of x, y, z, yaw, pitch and roll; 0 for an axis on which any value will do"""
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support import xla
-from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import frame_from_pose
@@ -20,9 +20,7 @@ MM = 1e-3
 
 def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_same():
     """A network that looks at a spring: poses of reset, step, pool and reward are corrected, and the body."""
-    config = EnvConfig(
-        engine="chain", n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0), pipe_diameter_mm=300.0
-    )
+    config = EnvConfig(engine="chain", n_poses=64, pipe_diameter_mm=300.0)
     n_springs = SHORT.n_chambers
     weight = np.zeros((9 + n_springs, 6), np.float32)
     weight[9, 0] = 30.0  # mm for half the range of the first spring

@@ -14,7 +14,7 @@ from mjx_softarm.env.state import EpisodeMotion
 from mjx_softarm.mechanics.params import ArmParams
 
 MM = 1e-3
-SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2, sensor_noise_mm=2.0)
+SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2)
 
 
 def with_arm(state, **changes):
@@ -40,7 +40,6 @@ def test_without_randomisation_every_arm_is_the_nominal_one(spec, env, start):
     drawn = jax.vmap(env.params_of)(start.pipeline_state)
     for name in nominal._fields:
         assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
-    np.testing.assert_array_equal(start.pipeline_state.sensor_offset_m, 0.0)
 
 
 def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, env, randomised):
@@ -85,27 +84,9 @@ def test_a_payload_is_observed_as_it_is_from_start_to_end(spec, quick_compiler):
     assert np.ptp(start.obs[:, -1]) > 0.4
 
 
-def test_sensor_noise_has_its_standard_deviation_and_no_mean(randomised):
-    offset_mm = 1e3 * np.asarray(randomised.pipeline_state.sensor_offset_m)
-    n = offset_mm.size  # the bounds are five standard errors
-    assert abs(offset_mm.mean()) < 5 * 2.0 / np.sqrt(n)
-    assert abs(offset_mm.std() - 2.0) < 5 * 2.0 / np.sqrt(2 * n)
-    assert abs(np.corrcoef(offset_mm.T) - np.eye(9)).max() < 0.25  # springs for themselves
-
-
-def test_the_law_holds_readings_on_their_references_so_that_noise_shifts_the_true_lengths(
-    env, randomised, step, random_actions
-):
-    wanted = 0.175 + 0.005 * random_actions  # well within reach
-    arm = step(randomised, env.action_of(wanted)).pipeline_state
-    reading = arm.spring_m + randomised.pipeline_state.sensor_offset_m
-    np.testing.assert_allclose(reading, wanted, atol=0.11 * MM)
-    assert float(jnp.abs(arm.spring_m - wanted).max()) > 5 * MM
-
-
 def test_an_arm_keeps_its_own_numbers_for_the_whole_episode(env, randomised, step, random_actions):
     after = step(step(randomised, env.action_of(env.pool.spring_m)), random_actions)
-    for name in ("payload_kg", "chamber_stiffness", "sensor_offset_m"):
+    for name in ("payload_kg", "chamber_stiffness"):
         assert np.array_equal(getattr(after.pipeline_state, name), getattr(randomised.pipeline_state, name))
 
 

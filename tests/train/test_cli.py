@@ -198,7 +198,7 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
             "--learner.stages: got '0.5,1', expected SHARE,EVERY,KEPT",
         ),
         (["sweep", "--vary", "learner.gamma"], "--vary: got 'learner.gamma', expected NAME=VALUE,..."),
-        (["reach", "--seed", "-1"], "seed: got -1, expected at least 0"),
+        (["reach", "--seed", "-1"], "seed: got -1, expected a whole number >= 0"),
         (["export"], "RUN: got 0, expected one folder of a run or more"),
         (["reach", "--spec", "absent.toml"], "absent.toml: got 'No such file or directory', expected a spec"),
         (

@@ -33,6 +33,7 @@ from jax import Array
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
 from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.fields import Amount, Count, Positive, Share
 from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
@@ -55,25 +56,14 @@ class AnalyticConfig(LearnerConfig):
 
     hidden: tuple[int, ...] = (256, 256, 256, 256)  # widths of the policy's hidden layers
     activation: Activation = "swish"  # function after each of them
-    n_arms: int = 64  # arms of a gradient step
-    total_env_steps: int = 64 * 49_152  # actions of all arms together; each arm takes one per gradient step
-    vector_steps_per_epoch: int = 256  # gradient steps between two reports
-    learning_rate: float = 2e-3  # learning rate at first (Adam)
-    learning_rate_half: float = 3_000.0  # gradient steps t_half of the rate's decay, 1 / (1 + t / t_half)
-    mean_share: float = 0.1  # share of the gradient steps so far over which the mean policy averages
-    saturation_cost_per_mm: float = 0.1  # c of the loss
-    horizon: int = 1  # actions that a gradient step looks ahead; more than one for arms in motion
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        required = {
-            "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
-            "learning_rate_half": (self.learning_rate_half > 0.0, "a number > 0"),
-            "mean_share": (0.0 <= self.mean_share <= 1.0, "a number in [0, 1]"),
-            "saturation_cost_per_mm": (self.saturation_cost_per_mm >= 0.0, "a number >= 0"),
-            "horizon": (self.horizon >= 1, "a whole number >= 1"),
-        }
-        check_settings("learner", self, required)
+    n_arms: Count = 64  # arms of a gradient step
+    total_env_steps: Count = 64 * 49_152  # actions of all arms together; each arm takes one per gradient step
+    vector_steps_per_epoch: Count = 256  # gradient steps between two reports
+    learning_rate: Amount = 2e-3  # learning rate at first (Adam)
+    learning_rate_half: Positive = 3_000.0  # gradient steps t_half of the rate's decay, 1 / (1 + t / t_half)
+    mean_share: Share = 0.1  # share of the gradient steps so far over which the mean policy averages
+    saturation_cost_per_mm: Amount = 0.1  # c of the loss
+    horizon: Count = 1  # actions that a gradient step looks ahead; more than one for arms in motion
 
     def check(self, env: EnvConfig) -> None:
         """Raise InputError for an engine whose gradient this learner does not take."""
@@ -249,7 +239,7 @@ class GradientEpoch:
         end, config = after.pipeline_state, self.env.config
         error = rewards.scaled_error(end.pose, end.goal, config.reward)  # (6,)
         off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
-        off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
+        off_m = self.env.reference_m(action) - end.spring_m  # (A,)
         if config.moves:  # springs on their way are off their references, too: only blocked ones count
             off_m = control.blocked_springs(after.info["blocked"], self.env.gains) * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))

@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.fields import Amount, Positive, check_ranges
 from train.agent.networks import descend
 
 Score = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...)
@@ -36,19 +36,13 @@ class GailConfig:
     """Hyperparameters of the discriminator."""
 
     hidden: tuple[int, ...] = (256, 256)  # widths of the hidden layers
-    learning_rate: float = 3e-4  # learning rate (Adam)
-    gradient_penalty: float = 20.0  # weight of the gradient penalty, the paper's lambda
+    learning_rate: Amount = 3e-4  # learning rate (Adam)
+    gradient_penalty: Amount = 20.0  # weight of the gradient penalty, the paper's lambda
     penalty_on: Penalised = "logit"  # output whose gradient is penalised; the paper's is the probability
-    input_scale: float = 10.0  # factor on observations and actions, hence on the logit's slope
+    input_scale: Positive = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:
-        required = {
-            "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
-            "gradient_penalty": (self.gradient_penalty >= 0.0, "a number >= 0"),
-            "penalty_on": (self.penalty_on in get_args(Penalised), f"one of {get_args(Penalised)}"),
-            "input_scale": (self.input_scale > 0.0, "a number > 0"),
-        }
-        check_settings("learner.gail", self, required)
+        check_ranges("learner.gail", self)
 
 
 class DiscriminatorState(NamedTuple):

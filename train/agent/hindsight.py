@@ -20,6 +20,7 @@ from jax import Array
 
 from mjx_softarm._support import draws
 from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.fields import Number, Share, check_ranges
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from train.agent.learner import Experience, Transition
@@ -33,20 +34,16 @@ class HindsightConfig:
 
     VARIABLE = ("reached_share", "near_share")
 
-    reached_share: float = 0.5  # share whose goal becomes the pose reached
-    near_share: float = 0.0  # share whose goal becomes a pose near the one reached
-    n_later: int = 0  # largest number of actions to a reached pose, and to half of the near ones
+    reached_share: Share = 0.5  # share whose goal becomes the pose reached
+    near_share: Share = 0.0  # share whose goal becomes a pose near the one reached
+    n_later: Number = 0  # largest number of actions to a reached pose, and to half of the near ones
     exchange_actions: bool = True  # relabelled, a saturated action becomes the sensed one
     saturation_costs: bool = True  # also where the goal is the pose reached; in the paper that has its bonus
 
     def __post_init__(self) -> None:
-        total = self.reached_share + self.near_share
-        required = {
-            "reached_share": (self.reached_share >= 0 and total <= 1, "0 to 1 - near_share"),
-            "near_share": (0 <= self.near_share <= 1, "0 to 1"),
-            "n_later": (self.n_later >= 0, "at least 0"),
-        }
-        check_settings("learner.hindsight", self, required)
+        check_ranges("learner.hindsight", self)
+        fits = self.reached_share + self.near_share <= 1
+        check_settings("learner.hindsight", self, {"reached_share": (fits, "at most 1 - near_share")})
 
 
 def relabel(

@@ -19,7 +19,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,15 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.fields import (
+    Amount,
+    Count,
+    Number,
+    PartialShare,
+    PositiveShare,
+    Share,
+    check_ranges,
+)
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import choose_arms
@@ -49,17 +58,12 @@ EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they a
 class GoalStage:
     """A part of the schedule of demonstrated goals."""
 
-    share: float = 1.0  # share of the run's environment steps
-    every: int = 1  # every n-th demonstrated pose is a goal; 1 is all of them
-    kept: float = 1.0  # share of the replay's transitions that is kept as the stage begins
+    share: PositiveShare = 1.0  # share of the run's environment steps
+    every: Count = 1  # every n-th demonstrated pose is a goal; 1 is all of them
+    kept: Share = 1.0  # share of the replay's transitions that is kept as the stage begins
 
     def __post_init__(self) -> None:
-        required = {
-            "share": (0.0 < self.share <= 1.0, "more than 0 and at most 1"),
-            "every": (self.every >= 1, "at least 1"),
-            "kept": (0.0 <= self.kept <= 1.0, "0 to 1"),
-        }
-        check_settings("learner.stages", self, required)
+        check_ranges("learner.stages", self)
 
 
 def _stages(words: list[str]) -> tuple[GoalStage, ...]:
@@ -87,13 +91,13 @@ class ImitationConfig(TQCConfig):
 
     gail: GailConfig = field(default_factory=GailConfig)
     """discriminator"""
-    learned_weight: float = 1.0
+    learned_weight: Amount = 1.0
     """weight of the learned reward; with 0, only the poses of the demonstrations are used"""
-    hand_made_weight: float = 0.0
+    hand_made_weight: Amount = 0.0
     """weight of the environment's reward"""
     frozen: bool = False
     """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
-    expert_share: float = 0.25
+    expert_share: PartialShare = 0.25
     """share of the critics' batches that is the expert's"""
     expert_start: ExpertStart = "agent"
     """state at which the discriminator sees the expert's action: the agent's; or, as in the paper, the pose
@@ -101,23 +105,16 @@ class ImitationConfig(TQCConfig):
     stages: Annotated[tuple[GoalStage, ...], STAGES_OPTION] = (GoalStage(),)
     """stages in order: share of the env steps (all add up to 1), every n-th pose is a goal, share of the
     replay that is kept as the stage begins"""
-    rebalance_env_steps: int = 0
+    rebalance_env_steps: Number = 0
     """env steps between two shifts of the goals towards those missed by most; 0 is never"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        hand_made = self.hand_made_weight > 0 or self.hand_made_weight == 0 < self.learned_weight
+        rewarded = self.hand_made_weight > 0 or self.learned_weight > 0
         total = sum(stage.share for stage in self.stages)
         apart = len(set(self.stage_epochs)) == len(self.stages)
         required = {
-            "expert_share": (0.0 <= self.expert_share < 1.0, "0 or more and less than 1"),
-            "expert_start": (self.expert_start in get_args(ExpertStart), f"one of {get_args(ExpertStart)}"),
-            "learned_weight": (self.learned_weight >= 0, "a number >= 0"),
-            "hand_made_weight": (
-                hand_made,
-                "a number >= 0, and more where learned_weight is 0",
-            ),
-            "rebalance_env_steps": (self.rebalance_env_steps >= 0, "at least 0"),
+            "hand_made_weight": (rewarded, "a number > 0 where learned_weight is 0"),
             "stages": (math.isclose(total, 1.0, abs_tol=1e-6), f"shares that add up to 1, not {total:g}"),
             "stage_epochs": (apart, f"an epoch or more for each stage; there are {self.n_epochs}"),
         }

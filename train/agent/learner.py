@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 
 from jax import Array
 
-from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.fields import Count, check_ranges
 from mjx_softarm._support.mlp import Activation
 from mjx_softarm.env import EnvConfig
 
@@ -23,13 +23,12 @@ class LearnerConfig:
 
     hidden: tuple[int, ...] = (256, 256)  # widths of the policy's hidden layers
     activation: Activation = "relu"  # function after each of them
-    n_arms: int = 128  # arms simulated side by side
-    total_env_steps: int = 300_000  # actions of all arms together
-    vector_steps_per_epoch: int = 16  # actions of each arm between two reports
+    n_arms: Count = 128  # arms simulated side by side
+    total_env_steps: Count = 300_000  # actions of all arms together
+    vector_steps_per_epoch: Count = 16  # actions of each arm between two reports
 
     def __post_init__(self) -> None:
-        counts = ("n_arms", "total_env_steps", "vector_steps_per_epoch")
-        check_settings("learner", self, {name: (getattr(self, name) >= 1, "at least 1") for name in counts})
+        check_ranges("learner", self)
 
     def check(self, env: EnvConfig) -> None:
         """Raise InputError where the learner cannot learn in an environment."""

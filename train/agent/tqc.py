@@ -33,6 +33,7 @@ from jax import Array
 
 from mjx_softarm._support import draws
 from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.fields import Amount, Count, Number, Positive, PositiveShare, Share
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
 from train.agent import networks
@@ -54,17 +55,17 @@ class TQCConfig(ReplayConfig):
     VARIABLE += ("reward_scale", *(f"hindsight.{name}" for name in HindsightConfig.VARIABLE))
 
     hidden_critic: tuple[int, ...] = (256, 256)  # widths of each critic's hidden layers
-    n_critics: int = 2  # number of critics
-    n_quantiles: int = 25  # quantiles per critic
-    n_drop_per_critic: int = 2  # largest pooled target quantiles dropped, per critic
+    n_critics: Count = 2  # number of critics
+    n_quantiles: Count = 25  # quantiles per critic
+    n_drop_per_critic: Number = 2  # largest pooled target quantiles dropped, per critic
     layer_norm: bool = False  # layer normalisation in the critics
-    n_ahead: int = 0  # held actions whose predicted errors the critics observe, in motion; see `Predictor`
-    learning_rate: float = 3e-4  # learning rate of actor and critics (Adam)
-    learning_rate_end: float = 1.0  # share of the learning rate left at the end of a half-cosine decay
-    learning_rate_alpha: float = 3e-4  # learning rate of the temperature; 0 holds it at initial_alpha
-    gamma: float = 0.99  # discount per step
-    tau: float = 0.005  # Polyak rate of the target critics and of the mean actor, per update
-    initial_alpha: float = 1.0  # initial temperature
+    n_ahead: Number = 0  # held actions whose predicted errors the critics observe, in motion; see `Predictor`
+    learning_rate: Amount = 3e-4  # learning rate of actor and critics (Adam)
+    learning_rate_end: Share = 1.0  # share of the learning rate left at the end of a half-cosine decay
+    learning_rate_alpha: Amount = 3e-4  # learning rate of the temperature; 0 holds it at initial_alpha
+    gamma: Share = 0.99  # discount per step
+    tau: PositiveShare = 0.005  # Polyak rate of the target critics and of the mean actor, per update
+    initial_alpha: Positive = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
 
@@ -72,14 +73,7 @@ class TQCConfig(ReplayConfig):
         super().__post_init__()
         required = {
             "hidden_critic": (len(self.hidden_critic) > 0, "at least one layer"),
-            "n_critics": (self.n_critics > 0, "a positive number"),
-            "n_ahead": (self.n_ahead >= 0, "at least 0"),
-            "n_drop_per_critic": (0 <= self.n_drop_per_critic < self.n_quantiles, "0 to n_quantiles - 1"),
-            "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
-            "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
-            "gamma": (0.0 <= self.gamma <= 1.0, "a number in [0, 1]"),
-            "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
-            "initial_alpha": (self.initial_alpha > 0.0, "a positive number"),
+            "n_drop_per_critic": (self.n_drop_per_critic < self.n_quantiles, "less than n_quantiles"),
         }
         check_settings("learner", self, required)
 

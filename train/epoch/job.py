@@ -11,6 +11,7 @@ from jax import Array
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.env.reach import POOL_SEED
 from mjx_softarm.mechanics.workspace import Pool
 
 T = TypeVar("T")
@@ -118,7 +119,7 @@ class FreshPoses:
 
     def __init__(self, env: ReachEnv, every: int, n_epochs: int, seed: int):
         self._pool, self._every, self._n_pools = env.poses, every, -(-n_epochs // every) if every else 1
-        self._seeds, self._thread = (env.config.workspace_seed, seed), ThreadPoolExecutor(1)
+        self._seeds, self._thread = (POOL_SEED, seed), ThreadPoolExecutor(1)
         self._futures: dict[int, Future[Pool]] = {}  # by number of the pool
 
     def __call__(self, epoch: int) -> Pool:

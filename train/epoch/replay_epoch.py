@@ -17,6 +17,7 @@ from jax import Array
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
 from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.fields import Count, Number
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv
@@ -32,10 +33,10 @@ COUNTS = ("env/unsettled", "env/episodes", "env/successes")  # metrics summed ov
 class ReplayConfig(LearnerConfig):
     """Settings of a learner from the replay. Raises InputError."""
 
-    episode_length: int = N_ACTIONS  # actions per episode at most
+    episode_length: Count = N_ACTIONS  # actions per episode at most
     updates_per_env_step: float = 1.0  # gradient steps per action of one arm
-    warmup_env_steps: int = 2_048  # actions drawn uniformly before the first gradient step
-    batch_size: int = 256  # transitions per gradient step
+    warmup_env_steps: Number = 2_048  # actions drawn uniformly before the first gradient step
+    batch_size: Count = 256  # transitions per gradient step
     replay_capacity: int = 400_000  # transitions kept
     hindsight: HindsightConfig = field(default_factory=HindsightConfig)
     """relabelled goals, as shares of a batch; the rest keeps its own goals"""
@@ -45,10 +46,7 @@ class ReplayConfig(LearnerConfig):
         of_arms = f"a finite number of at least one update per step of all {self.n_arms} arms"
         updates = math.isfinite(self.updates_per_env_step) and self.n_updates_per_vector_step >= 1
         required = {
-            "episode_length": (self.episode_length >= 1, "at least 1"),
             "updates_per_env_step": (updates, f"{of_arms}, {1 / self.n_arms:.4g}"),
-            "warmup_env_steps": (self.warmup_env_steps >= 0, "at least 0"),
-            "batch_size": (self.batch_size >= 1, "at least 1"),
             "replay_capacity": (self.replay_capacity >= self.n_arms, f"at least n_arms = {self.n_arms}"),
         }
         check_settings("learner", self, required)
@@ -253,7 +251,7 @@ class ReplayEpoch:
     def _experience(self, before: State, action: Array, after: State) -> Experience:
         """Return the transitions of n arms as they are stored."""
         start, end = before.pipeline_state, after.pipeline_state
-        sensed_action = self.env.action_of(end.spring_m + end.sensor_offset_m)
+        sensed_action = self.env.action_of(end.spring_m)
         if self.env.config.moves:  # the arm moves on: the other references still count
             blocked = control.blocked_springs(after.info["blocked"], self.env.gains)
             sensed_action = jnp.where(blocked, sensed_action, action)

@@ -171,7 +171,6 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
             provenance,
             activation=run.config.learner.activation,
             observation=env.observation,
-            tolerance_m=1e-3 * env.saturation_tolerance_mm,
             n_actions=N_ACTIONS,
             action_s=env.dynamic_step_s if env.moves else 0.0,
         )

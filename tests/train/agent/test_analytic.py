@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 @pytest.fixture(scope="module")
 def epoch():
     """Arms that differ in payload, stiffness and sensor bias."""
-    randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05, sensor_noise_mm=0.5)
+    randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05)
     env = ReachEnv(SHORT, EnvConfig(engine="chain", n_poses=256, randomisation=randomisation))
     return GradientEpoch(CONFIG, env)
 
