@@ -45,7 +45,7 @@ def server():
 @pytest.fixture(scope="session")
 def browser():
     pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
-    api = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
+    api = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install -e '.[test]'")
     path = shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("needs a browser: apt install chromium")
