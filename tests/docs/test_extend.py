@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,3 +100,34 @@ def test_tqc_swings_pendulums_up():
     before = reward[: page["EPISODE"]].sum(axis=0).mean()  # random actions for half of the episode
     after = np.mean([page["returns"](policy, key) for key in keys])  # 32 episodes: single ones differ by 300
     assert before < -700.0 and after > -400.0  # random: -1,200
+
+
+def test_the_page_s_own_driver_reads_writes_and_never_returns_a_late_answer(monkeypatch):
+    class Board:
+        """A serial port: what was sent, and the answers to come."""
+
+        def __init__(self, *settings, timeout):
+            self.sent, self.answers = [], [b"1 2 3 4 5 6 7 8 9\n", b"1 2\n"]
+            self.waiting = [b"a late answer\n"]
+
+        def reset_input_buffer(self):
+            self.waiting.clear()
+
+        def write(self, line):
+            self.sent.append(line)
+            if line == b"R\n":
+                self.waiting.append(self.answers.pop(0))
+
+        def readline(self):
+            return self.waiting.pop(0)
+
+    monkeypatch.setitem(sys.modules, "serial", SimpleNamespace(Serial=Board))
+    page = (ROOT / "docs/your-arm.md").read_text("utf-8")
+    names = {}
+    exec(re.search(r"```python\n(.+?)```", page, re.S)[1], names)
+    arm = names["Arm"]()
+    np.testing.assert_array_equal(arm.read_sensors(), np.arange(1.0, 10.0))
+    with pytest.raises(TimeoutError):
+        arm.read_sensors()
+    arm.write_pressures(np.arange(-4.0, 5.0))
+    assert arm.board.sent[-1] == b"P -4.00 -3.00 -2.00 -1.00 0.00 1.00 2.00 3.00 4.00\n"
