@@ -78,7 +78,7 @@ Arm = Annotated[
 
 
 @dataclass(frozen=True)
-class ArmOptions:
+class DriverOptions:
     """Options of a command that drives an arm: the arm, and motion capture beside its driver."""
 
     arm: Arm
@@ -100,7 +100,7 @@ class ArmOptions:
         return with_capture(open_arm(self.arm), self.capture, spec, tell)
 
 
-Arms = Annotated[ArmOptions, tyro.conf.arg(name="")]
+Arms = Annotated[DriverOptions, tyro.conf.arg(name="")]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -75,7 +75,7 @@ class EnvConfig:
         return None if self.pipe_diameter_mm is None else CrossPipe.of_mm(self.pipe_diameter_mm)
 
     @property
-    def moves(self) -> bool:
+    def in_motion(self) -> bool:
         """Whether the arm is in motion."""
         return self.mode == "dynamic"
 
@@ -110,7 +110,7 @@ class EnvConfig:
 
         # Settings that go together
         engines = ENGINES[self.mode]
-        observed = self.moves or self.observation != "motion"
+        observed = self.in_motion or self.observation != "motion"
         no_cost = self.pipe_diameter_mm is not None or not self.clearance_cost_per_mm
         required = {
             "engine": (self.engine in engines, f"one of {engines} with the mode {self.mode!r}"),

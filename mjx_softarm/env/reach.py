@@ -156,7 +156,7 @@ class ReachEnv(brax_envs.Env):
         self.uses_mjx = self.config.engine != "chain"
         self.n_at_once = arms_at_once(self.spec.n_links)
         self.model, self._data = put(build_model(self.spec)) if self.uses_mjx else (None, None)
-        self._results = MotionResult if self.config.moves else SettleResult
+        self._results = MotionResult if self.config.in_motion else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
         self.poses = PosePool(self.spec, self.config, self._observed_pose)
         self.sample_pool = self.poses.sample
@@ -190,7 +190,7 @@ class ReachEnv(brax_envs.Env):
     @property
     def backend(self) -> str:
         """Simulation that runs: the engine, at rest or in motion."""
-        return f"{self.config.engine} dynamic" if self.config.moves else self.config.engine
+        return f"{self.config.engine} dynamic" if self.config.in_motion else self.config.engine
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
         """Return the pose as it is observed: corrected, if there is a sim-to-real network."""
@@ -214,7 +214,7 @@ class ReachEnv(brax_envs.Env):
     def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
         """Draw the random numbers of n episodes: leaves (n, ...)."""
         key, shape = jax.random.fold_in(rng, 1), (n, self.episode_motion.n_draws)
-        moving = draws.uniform(key, shape) if self.config.moves else None
+        moving = draws.uniform(key, shape) if self.config.in_motion else None
         return EpisodeNoise(draws.uniform(rng, (n, 3 + self.spec.n_chambers)), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
@@ -246,7 +246,7 @@ class ReachEnv(brax_envs.Env):
         metrics |= {f"reward_{name}": zero for name in terms}
         info = {"saturated": jnp.array(False), "blocked": jnp.zeros(self.spec.n_chambers, bool)}
         info |= {"valid": jnp.array(True), "clearance_mm": self._clearance_mm(start.q, start.pose)}
-        if self.config.moves:
+        if self.config.in_motion:
             info["path_mm"] = jnp.zeros((self.n_ticks, 3))
         return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
 
@@ -312,7 +312,7 @@ class ReachEnv(brax_envs.Env):
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | MotionEnd]:
         """Move to true spring lengths (n_springs,): return the motion and the observables at its end."""
         params, config = self.params_of(arm), self.config
-        if config.moves:
+        if config.in_motion:
             moving = MovingArm(self.model, self._data, params, arm.moving)
             times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
             arguments = moving, arm.motion, reference_m, self.gains, *times_s

@@ -72,8 +72,8 @@ class EpisodeMotion:
         # Commands that wait at a time, and those of an arm at rest; an arm that is always at rest needs none
         spread = 1.0 + self._spread.regulator_spread * self._regulated
         longest_s = spread * float(np.max(actuators.delay_s)) + self._spread.delay_max_s
-        self.n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.moves else 0
-        self._offset_kpa = self._actuators.rest_offset_kpa if config.moves else None
+        self.n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.in_motion else 0
+        self._offset_kpa = self._actuators.rest_offset_kpa if config.in_motion else None
 
     def params(self, share: Array | None) -> MotionParams:
         """Return the parameters of an episode.

@@ -17,7 +17,7 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.__main__ import Arm, ArmOptions, finish, tell
+from mjx_softarm.deploy.__main__ import Arm, DriverOptions, finish, tell
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import check_arm
 from mjx_softarm.deploy.ending import save_log
@@ -43,7 +43,7 @@ class Address:
 
 
 @dataclass(frozen=True)
-class Steered(ArmOptions):
+class Steered(DriverOptions):
     """Arm that the page steers, and its policy."""
 
     arm: Arm = "twin:0"

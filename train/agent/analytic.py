@@ -67,7 +67,7 @@ class AnalyticConfig(LearnerConfig):
 
     def check(self, env: EnvConfig) -> None:
         """Raise InputError for an engine whose gradient this learner does not take."""
-        engine = "mjx" if env.moves else "chain"
+        engine = "mjx" if env.in_motion else "chain"
         usable = env.engine == engine
         check_settings("env", env, {"engine": (usable, f"{engine!r}, whose gradient this learner takes")})
 
@@ -240,7 +240,7 @@ class GradientEpoch:
         error = rewards.scaled_error(end.pose, end.goal, config.reward)  # (6,)
         off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
         off_m = self.env.reference_m(action) - end.spring_m  # (A,)
-        if config.moves:  # springs on their way are off their references, too: only blocked ones count
+        if config.in_motion:  # springs on their way are off their references, too: only blocked ones count
             off_m = control.blocked_springs(after.info["blocked"], self.env.gains) * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
         return off + cost + self.env.clearance_cost(after.info["clearance_mm"])

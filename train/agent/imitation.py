@@ -127,7 +127,7 @@ class ImitationConfig(TQCConfig):
         """
         super().check(env)
         required = {
-            "mode": (not env.moves, "'quasistatic' for demonstrations"),
+            "mode": (not env.in_motion, "'quasistatic' for demonstrations"),
             "observation": (env.observation == "pose", "'pose' for demonstrations"),
         }
         check_settings("env", env, required)

@@ -252,7 +252,7 @@ class ReplayEpoch:
         """Return the transitions of n arms as they are stored."""
         start, end = before.pipeline_state, after.pipeline_state
         sensed_action = self.env.action_of(end.spring_m)
-        if self.env.config.moves:  # the arm moves on: the other references still count
+        if self.env.config.in_motion:  # the arm moves on: the other references still count
             blocked = control.blocked_springs(after.info["blocked"], self.env.gains)
             sensed_action = jnp.where(blocked, sensed_action, action)
         return Experience(

@@ -167,7 +167,7 @@ def nominal(env: ReachEnv) -> ReachEnv:
     compile.
     """
     other = copy.copy(env)
-    engine = env.config.engine if env.config.moves else "chain"
+    engine = env.config.engine if env.config.in_motion else "chain"
     config = dataclasses.replace(env.config, engine=engine)
     other.config = dataclasses.replace(config, randomisation=Randomisation(payload_max_kg=0.0))
     other.episode_motion = EpisodeMotion(env.spec, other.config)
@@ -207,7 +207,7 @@ def reach(
     (state, _), way = jax.lax.scan(act, begin, None, length=n_actions)
     arm = state.pipeline_state
     near_s = jnp.asarray(jnp.nan)
-    if env.config.moves:
+    if env.config.in_motion:
         way_mm = jnp.concatenate([way["path_mm"].reshape(-1, 3), arm.pose[None, :3]])
         near_s = time_near(way_mm, goal[:3], 1.0 / env.spec.control.rate_hz)
     return state, Reached(
@@ -217,7 +217,7 @@ def reach(
         saturated_chambers=state.metrics["saturated_chambers"],
         settled=jnp.all(way["valid"]),
         pressure_kpa=arm.pressure_kpa,
-        clearance_mm=jnp.min(way["clearance_mm"]) if env.config.moves else state.info["clearance_mm"],
+        clearance_mm=jnp.min(way["clearance_mm"]) if env.config.in_motion else state.info["clearance_mm"],
         near_s=near_s,
     )
 

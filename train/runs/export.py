@@ -172,7 +172,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
             activation=run.config.learner.activation,
             observation=env.observation,
             n_actions=N_ACTIONS,
-            action_s=env.dynamic_step_s if env.moves else 0.0,
+            action_s=env.dynamic_step_s if env.in_motion else 0.0,
         )
     except (ValueError, AttributeError) as error:
         raise InputError(f"{run.path}: {error}") from error

@@ -81,7 +81,7 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
 def _errors_mm(run: Run) -> dict[str, float]:
     """Return errors of a policy in simulation, with corrected goals at rest."""
     evaluate = runs.task_of_run(run).evaluate
-    if not run.config.env.moves:  # the loop corrects the last references of policies of motion instead
+    if not run.config.env.in_motion:  # the loop corrects the last references of policies of motion instead
         evaluate = evaluate.on(evaluate.env, shift_limit=SHIFT_LIMIT)
     figures = evaluate(run.policy())[0].to_dict()
     return {name: figures[key] for name, key in ERRORS.items() if key in figures}

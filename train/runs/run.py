@@ -144,7 +144,7 @@ def noted(console: Console, text: str) -> Iterator[None]:
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
     """Raise InputError where most of an epoch's actions of arms in motion led to no finite state."""
     n_actions = config.learner.n_env_steps(1)
-    if config.env.moves and n_unsettled > n_actions / 2:
+    if config.env.in_motion and n_unsettled > n_actions / 2:
         raise InputError(
             f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
             f"{n_actions} actions diverged, expected a shorter time step for this arm"

@@ -45,7 +45,9 @@ MOVING = {
 @pytest.mark.parametrize("change", [{}, {"engine": "mjx"}, MOVING], ids=["chain", "mjx", "dynamic"])
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
-    if config.env.moves:  # with goals that the episode reached later, and critics that observe a prediction
+    if (
+        config.env.in_motion
+    ):  # with goals that the episode reached later, and critics that observe a prediction
         hindsight = dataclasses.replace(config.learner.hindsight, n_later=2)
         learner = dataclasses.replace(config.learner, hindsight=hindsight, n_ahead=2)
         config = dataclasses.replace(config, learner=learner)
@@ -57,7 +59,7 @@ def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
         ended[k] = metrics["env/episodes"], metrics["env/successes"]
     assert job.n_traces == 1 and int(state.n_epochs) == 4
     # Episodes end at their goals, or after four actions. In motion these are near enough without saturation.
-    if config.env.moves:
+    if config.env.in_motion:
         assert metrics["tqc/prediction_loss"] > 0.0
         np.testing.assert_array_equal(ended[:, 0], [0, 8, 0, 8])
         last = np.asarray(state.memory.data.n_steps) == 4
