@@ -22,6 +22,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.checks import Finding
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.logs.wiring import wiring_faults
 from mjx_softarm.spec import ArmSpec
 
 Logs = Annotated[
@@ -56,7 +57,7 @@ def _template(out: tyro.conf.Positional[Path] = Path("log.csv")) -> int:
 
 
 def _check(logs: Logs, spec: cli.SpecFile = None, strict: Strict = False) -> int:
-    """Print the faults of logs."""
+    """Print the faults of logs, and of the arm's wiring where they show it."""
     read, findings = _read(logs, ArmSpec.of(spec), strict)
     for log in read:
         print(f"{log.source}: {len(log)} rows to use, {log.time_s[-1] - log.time_s[0]:.1f} s")
@@ -152,6 +153,7 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
     logs, findings = [], []
     for path in paths:
         log, of_log = read_log(path, spec, strict)
+        of_log = [*of_log, *(Finding(str(path), None, "", fault) for fault in wiring_faults(log, spec))]
         logs.append(log)
         findings += of_log
         for finding in of_log:

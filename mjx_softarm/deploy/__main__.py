@@ -39,6 +39,7 @@ from mjx_softarm.deploy.record import ACCURACY, record
 from mjx_softarm.deploy.session import LoopRun, follow, trace
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.logs.wiring import wiring_faults
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
@@ -287,6 +288,8 @@ def _record(
     unseen = "; the arm has no motion capture, so tip and markers are missing" * (result.log.tip_m is None)
     if result.ending.status != cli.ERROR:
         print(f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{unseen}")
+    for fault in wiring_faults(result.log, arm_spec):
+        print(f"wiring: {fault}", file=sys.stderr)
     if result.n_unsettled:
         print(f"{result.n_unsettled} poses were not seen at rest in time")
     if result.ending.cause:

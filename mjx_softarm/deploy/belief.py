@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.control import Allocation, Gains, allocated_error, at_chambers, saturated
+from mjx_softarm.control import Gains, allocated_error, at_chambers, saturated
 from mjx_softarm.deploy.controller import Command, Controller
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import ARRIVED_M, still
@@ -34,6 +34,7 @@ STUCK_NEIGHBOUR_M = 2e-3  # motion of its section's springs at which a live one 
 # Lost chambers. By hand, and tested (tests/train/runs/test_estimator.py): no saturated simulated arm is taken
 # for one that leaks; 95 % of lost chambers are detected, 85 % with 500 g.
 LOST_SHARE = 0.5  # least share of the pressure that the arm's shape lacks
+NO_AIR_SHARE = 1.5  # share of all pressures from which the shape is not that without air
 EXPLAINED_SHARE = 0.7  # least share of the springs' squared deviations that this explains
 LOST_EFFECT_M = 0.01  # least change at the chamber; tolerances and payloads look like less
 _NO_EFFECT_M2 = 1e-18
@@ -171,9 +172,7 @@ def _with_trust(belief: Belief, last: Belief) -> Belief:
     gains, tolerance_m = policy.gains, policy.tolerance_m
     suspect = saturated(pressure_kpa, asked_m, belief.spring_m, gains, tolerance_m)
     if suspect.any():
-        suspect &= explained_by_pressure_loss(
-            policy.spring_model, pressure_kpa, belief.spring_m, gains.allocation
-        )
+        suspect &= explained_by_pressure_loss(policy.spring_model, pressure_kpa, belief.spring_m, gains)
     return replace(
         belief,
         settled=belief.at_rest
@@ -282,10 +281,7 @@ def _range(values: Array) -> Array:
 
 
 def explained_by_pressure_loss(
-    model: SpringModel,
-    pressure_kpa: Array,
-    spring_m: Array,
-    allocation: Allocation | None = None,
+    model: SpringModel, pressure_kpa: Array, spring_m: Array, gains: Gains
 ) -> Array:
     """Return for which chambers (n_chambers,) a loss of pressure explains the arm's shape.
 
@@ -294,23 +290,30 @@ def explained_by_pressure_loss(
     either is saturated or, if this holds, has lost its pressure. Redundant chambers make up for a lost one:
     the loss shows once one of them is at its limit.
 
+    Without air all chambers come to a limit, and the loss of all pressures together explains the shape.
+
     Args:
         model: network of the unloaded arm.
         pressure_kpa (n_chambers,) [kPa]: commanded pressures.
         spring_m (n_springs,) [m]: lengths.
-        allocation: matrices of an arm with redundant chambers.
+        gains: limits of the pressures; matrices of an arm with redundant chambers.
     """
     xp = array_namespace(pressure_kpa, spring_m)
-    diagonal = np.eye(len(pressure_kpa), dtype=bool)
-    one_less_kpa = xp.where(diagonal, 0.0, pressure_kpa)  # (n_chambers, n_chambers)
-    pressures_kpa = xp.concat([pressure_kpa[None], one_less_kpa])
-    springs_m = expected_springs(model, pressures_kpa)
-    effect_m = springs_m[1:] - springs_m[0]  # (n_chambers, n_springs)
+    n = len(pressure_kpa)
+    kept = np.concatenate([np.ones((1, n)), 1.0 - np.eye(n), np.zeros((1, n))]) > 0.0
+    springs_m = expected_springs(model, xp.where(kept, pressure_kpa, 0.0))  # with all, without one, with none
+    effect_m = springs_m[1:] - springs_m[0]  # (n_chambers + 1, n_springs)
     deviation_m = spring_m - springs_m[0]  # (n_springs,)
     size = xp.maximum(xp.sum(effect_m**2, axis=1), _NO_EFFECT_M2)  # zero where there is no pressure
-    share = effect_m @ deviation_m / size  # (n_chambers,)
+    share = effect_m @ deviation_m / size  # (n_chambers + 1,)
     left_m = deviation_m - share[:, None] * effect_m
     explained = 1.0 - xp.sum(left_m**2, axis=1) / xp.sum(deviation_m**2)
-    chamber_m = xp.abs(share * xp.sum(xp.where(diagonal, at_chambers(effect_m, allocation), 0.0), axis=1))
     enough = (share > LOST_SHARE) & (explained > EXPLAINED_SHARE)
-    return enough & (chamber_m > LOST_EFFECT_M)
+    chamber_m = xp.abs(
+        share[:, None] * at_chambers(effect_m, gains.allocation)
+    )  # (n_chambers + 1, n_chambers)
+    lost_m = xp.sum(xp.where(np.eye(n, dtype=bool), chamber_m[:-1], 0.0), axis=1)
+    alone = enough[:-1] & (lost_m > LOST_EFFECT_M)
+    at_limit = (pressure_kpa <= gains.pressure_min_kpa) | (pressure_kpa >= gains.pressure_max_kpa)
+    no_air = enough[-1:] & (share[-1:] < NO_AIR_SHARE) & (xp.max(chamber_m[-1]) > LOST_EFFECT_M)
+    return alone | (no_air & xp.all(at_limit))

@@ -145,7 +145,8 @@ def _chamber_faults(belief: Belief) -> Iterator[Event]:
     if lost.any():
         kpa = ", ".join(f"{value:.1f}" for value in belief.command.pressure_kpa[lost])
         text = f"{names('chamber', lost)}: at {kpa} kPa, but the arm has the shape it would have without that"
-        yield Event(Fault.CHAMBER_LOST, f"{text} pressure")
+        supply = ": is the supply of air on?" * bool(np.count_nonzero(lost) > 1)
+        yield Event(Fault.CHAMBER_LOST, f"{text} pressure{supply}")
 
 
 def _payload_faults(last: Belief, belief: Belief) -> Iterator[Event]:

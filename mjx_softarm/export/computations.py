@@ -193,9 +193,7 @@ def _judging_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computa
     settled = on_reference(inputs.springs_m, inputs.reference_m, inputs.pressure_kpa, gains, rest.arrived_m)
     mask = saturated(inputs.pressure_kpa, inputs.reference_m, inputs.spring_m, gains, policy.tolerance_m)
     stuck = stuck_springs(inputs.springs_m, inputs.pressures_kpa, policy.spec.structure.n_sections)
-    lost = explained_by_pressure_loss(
-        policy.spring_model, inputs.pressure_kpa, inputs.spring_m, gains.allocation
-    )
+    lost = explained_by_pressure_loss(policy.spring_model, inputs.pressure_kpa, inputs.spring_m, gains)
     # Error of a pose, and lengths that references make.
     pose = xp.asarray(inputs.pose, dtype=np.float64)
     weighted = weighted_error(pose, inputs.goal, policy.reward)

@@ -95,6 +95,17 @@ def test_lost_chamber_vents():
     assert 0.0 < vented.max() <= VENT_KPA_PER_S * DT_S + 1e-9
 
 
+def test_arm_without_air_vents():
+    class Airless(LinearArm):
+        def holds(self, pressure_kpa):
+            return np.zeros_like(pressure_kpa)
+
+    arm = Airless()
+    run = go(arm)
+    assert run.status == 3 and run.arrivals == () and "supply of air" in run.ending.cause
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
+
+
 def test_chamber_lost_while_the_goal_moves_vents():
     arm = Leaking(500)
     run = trace(arm, Controller.of(POLICY, between), GOALS[:2], pace_s=30.0)

@@ -120,9 +120,10 @@ def arms_at_rest(reference_m, payload_kg, dead):
 
 def found(distilled, end, commanded_kpa, reference_m):
     spring_m = end.spring_m + 4e-5 * np.random.default_rng(9).standard_normal(end.spring_m.shape)
-    suspect = saturated(commanded_kpa, reference_m, spring_m, Gains.from_spec(SPEC), TOLERANCE_M)
+    gains = Gains.from_spec(SPEC)
+    suspect = saturated(commanded_kpa, reference_m, spring_m, gains, TOLERANCE_M)
     rows = zip(commanded_kpa, spring_m, strict=True)
-    return suspect & np.array([explained_by_pressure_loss(distilled.spring_model, *row) for row in rows])
+    return suspect & [explained_by_pressure_loss(distilled.spring_model, *row, gains) for row in rows]
 
 
 @pytest.mark.parametrize("payload_kg", [0.0, 1.0])
@@ -132,6 +133,12 @@ def test_saturated_arms_are_not_taken_for_leaking(distilled, payload_kg):
     full = saturated(commanded_kpa, reference_m, end.spring_m, Gains.from_spec(SPEC), TOLERANCE_M)
     assert full.any(axis=1).mean() > 0.9
     assert not found(distilled, end, commanded_kpa, reference_m).any()
+
+
+def test_an_arm_without_air_is_found(distilled):
+    reference_m = np.random.default_rng(7).uniform(0.14, 0.22, (N_ARMS, N)).astype(np.float32)
+    end, commanded_kpa = arms_at_rest(reference_m, 0.0, np.ones((N_ARMS, N), bool))
+    assert found(distilled, end, commanded_kpa, reference_m).any(axis=1).mean() > 0.95
 
 
 @pytest.mark.parametrize(("payload_kg", "share"), [(0.0, 0.95), (0.5, 0.85)])
