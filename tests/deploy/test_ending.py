@@ -111,9 +111,7 @@ def test_fault_at_every_call_vents_and_keeps_the_rows(command):
     [
         (OSError("bus error"), "bus error"),
         (ValueError("beyond 20 kPa"), "beyond 20 kPa"),
-        (AttributeError("no port"), "no port"),
         (SystemExit(1), "1"),
-        (MemoryError(), "MemoryError"),
         (Mute(), "Mute"),
         (KeyboardInterrupt(), "interrupted"),
     ],
@@ -204,7 +202,7 @@ def test_interrupt_in_the_venting_alone_changes_nothing():
     assert vented(arm) and ending == ("interrupted", 130, True) and len(saved[0]) == n_ticks
 
 
-@pytest.mark.parametrize("error", [OSError("pump"), TimeoutError(), ValueError("no")])
+@pytest.mark.parametrize("error", [OSError("pump"), ValueError("no")])
 def test_venting_is_tried_again(error):
     n_ticks = len(drive("run", Faulty(None))[1])
     arm = Faulty(raises(error), "write_pressures", range(n_ticks + 2, n_ticks + 1 + VENT_TRIES))
