@@ -2,24 +2,16 @@
 
 import sys
 
-import jax
 import numpy as np
 import pytest
 
 from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import Worker
 from benchmarks.race import race
-from benchmarks.race.contestants import CONTESTANTS, Contestant, HeldOut, prepare, settings_of
+from benchmarks.race.contestants import CONTESTANTS, Contestant, prepare, settings_of
 from benchmarks.race.race import PeerTarget, RaceLimits, crossing, judge, limits_of, run, train
-from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.mdp.actions import N_ACTIONS
-from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
-from tests.train.small import SHORT
-from train.agent.tqc import TQC
 from train.presets import PRESETS
-from train.runs import evaluate
 
 FAKE = '''
 """A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each."""
@@ -75,20 +67,6 @@ def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkey
     assert work() == expected | {"ended": False}
     clock[0] += 1000  # nor while nobody asks
     assert (work()["wall_s"], work()["ended"]) == (13.0, True)
-
-
-def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler, monkeypatch):
-    monkeypatch.setattr(evaluate, "PATH", 6)
-    env = ReachEnv(SHORT, EnvConfig(n_poses=16))
-    agent = TQC(env.observation_size, env.action_size)
-    params = agent.init(jax.random.PRNGKey(3)).actor_params
-    errors_mm = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
-    paths = evaluate.paths_of(env.sample_pool(12, HELD_OUT_SEED).pose)
-    follow = jax.vmap(evaluate.follower(env, agent, N_ACTIONS), in_axes=(None, 0, 0))
-    reached = xla.jit(follow)(params, paths, evaluate.start_keys(2))
-    assert np.ptp(errors_mm) > 10.0
-    expected = np.linalg.norm((reached.pose - reached.goal)[..., :3], axis=-1)
-    np.testing.assert_allclose(errors_mm, expected.reshape(-1), atol=0.01)
 
 
 def test_the_learning_rate_of_peers_falls_as_that_of_quick():

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.harness.rounds import ROOT
-from benchmarks.speed.soromox_worker import HELD_S, N_STEPS, random_forces, section_matrices, stepper
-from benchmarks.speed.throughput import SOROMOX
+from benchmarks.speed.soromox_worker import N_STEPS, random_forces, section_matrices, stepper
 from mjx_softarm import ArmSpec
-from mjx_softarm.env import EnvConfig
 
 SPEC = ArmSpec.default()
 PYTHON = ROOT / ".venv-soromox" / "bin" / "python"
@@ -79,11 +77,6 @@ def test_the_implicit_step_rests_where_an_explicit_one_diverges():
         ends[method] = np.asarray(state)
     np.testing.assert_allclose(ends["implicit"][0], 0.5, atol=1e-3)
     assert not np.isfinite(ends["explicit"]).all()
-
-
-def test_the_implicit_step_is_as_long_as_mjx_s_and_every_method_has_a_row():
-    assert HELD_S / N_STEPS["implicit"] == pytest.approx(EnvConfig().simulation_step_s)
-    assert EnvConfig().dynamic_step_s == HELD_S and SOROMOX.keys() == N_STEPS.keys()
 
 
 @pytest.mark.skipif(not PYTHON.exists(), reason="the environment of SoRoMoX is not made")
