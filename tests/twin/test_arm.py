@@ -201,9 +201,9 @@ def test_survives_random_extremes():
 
 
 def test_payload_in_a_name():
-    named = [open_arm(f"twin:{name}:500g").motion_capture().tip_m for name in ("3", "rod:3")]
-    loaded = [kind(3, payload_kg=0.5).motion_capture().tip_m for kind in (Twin, RodTwin)]
-    np.testing.assert_array_equal(named, loaded)
+    for name, kind in (("3", Twin), ("rod:3", RodTwin)):
+        named_m = open_arm(f"twin:{name}:500g").motion_capture().tip_m
+        np.testing.assert_array_equal(named_m, kind(3, payload_kg=0.5).motion_capture().tip_m)
     in_pipe = open_arm("twin:7:pipe300:220g")
     lower_m = open_arm("twin:7:pipe300").motion_capture().tip_m - in_pipe.motion_capture().tip_m
     assert lower_m[2] > 1e-3 and in_pipe._pipe is not None
