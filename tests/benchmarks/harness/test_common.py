@@ -26,6 +26,7 @@ def test_a_missed_target_or_a_failure_ends_with_status_1_and_its_file_is_there(
     met, more, status, monkeypatch, tmp_path
 ):
     monkeypatch.setattr(common, "RESULTS", tmp_path)
-    figures = {"mm": 2.0, "targets": [target("1 mm", "0.5 mm", True), target("less", "2 mm", met)]} | more
+    targets = [target("1 mm", "0.5 mm", True), target("less", "2 mm", met)]
+    figures = {"mm": 2.0, "arms": 1024, "targets": targets} | more
     assert benchmarks._finish("settle", figures) == status
     assert json.loads((tmp_path / "settle.json").read_text())["figures"] == figures
