@@ -127,24 +127,6 @@ def test_an_arm_at_its_goal_terminates_and_the_others_go_on(envs):
     np.testing.assert_array_equal(infos["_tip_error_mm"], ~terminated)
 
 
-def test_an_arm_that_cannot_settle_is_reset_and_marked_while_the_others_go_on(envs):
-    first, _ = envs.reset(seed=7)
-    actions = still(envs)
-    actions[3, 5] = np.nan
-    obs, reward, terminated, truncated, infos = envs.step(actions)
-    failed = np.arange(N_ARMS) == 3
-    np.testing.assert_array_equal(truncated, failed)
-    assert not terminated.any() and reward[3] == 0.0
-    final = infos["final_info"]
-    assert not final["valid"][3] and final["unsettled"][3] == 1.0
-    np.testing.assert_array_equal(infos["final_obs"][3], first[3])
-    np.testing.assert_array_equal(infos["valid"], ~failed)
-    assert np.isfinite(obs).all()
-    assert not np.array_equal(obs[3, 6:12], first[3, 6:12])  # a new goal
-    *_, infos = envs.step(still(envs))
-    assert infos["valid"].all()
-
-
 def test_make_vec_gives_the_vector_environment_with_the_registered_time_limit():
     envs = gymnasium.make_vec(ENV_ID, num_envs=2, config=CONFIG)
     assert type(envs) is SoftArmVectorEnv and envs.num_envs == 2
