@@ -202,7 +202,7 @@ def test_interrupt_in_the_venting_alone_changes_nothing():
     assert vented(arm) and ending == ("interrupted", 130, True) and len(saved[0]) == n_ticks
 
 
-@pytest.mark.parametrize("error", [OSError("pump"), ValueError("no")])
+@pytest.mark.parametrize("error", [OSError("pump"), TimeoutError(), ValueError("no")])
 def test_venting_is_tried_again(error):
     n_ticks = len(drive("run", Faulty(None))[1])
     arm = Faulty(raises(error), "write_pressures", range(n_ticks + 2, n_ticks + 1 + VENT_TRIES))
