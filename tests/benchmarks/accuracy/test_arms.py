@@ -18,6 +18,16 @@ def test_a_refused_goal_or_a_far_circle_misses_the_target():
     assert targets[1]["measured"] == "0.33% in the mean, 1 of 4 goals refused"
 
 
+def test_the_picture_has_a_line_for_each_stand_in_over_its_minutes():
+    minutes = {("twin", 0, 60): 9.0, ("twin", 0, 20): 3.0, ("paper", 1, 60): 10.0}
+    rows = [
+        {"arm": arm, "seed": seed, "poses": n, "recording [min]": x, "circle, mean [mm]": 12.0 / x}
+        for (arm, seed, n), x in minutes.items()
+    ]
+    twin, rod = arms.minutes_figure(rows).axes[0].get_lines()
+    assert list(twin.get_xdata()) == [3.0, 9.0] and list(rod.get_ydata()) == [1.2]
+
+
 @pytest.mark.slow
 def test_smoke_and_what_was_made_is_not_made_again(tmp_path, monkeypatch):
     monkeypatch.setattr(common, "RESULTS", tmp_path / "results")
