@@ -114,15 +114,3 @@ def _turned(pose, gibbs):
     turned = apply_correction((np.zeros(3), np.eye(3)), np.concatenate([np.zeros(3), gibbs]))[1]
     turned = turned / np.cbrt(np.linalg.det(turned))
     return turned @ position_m, turned @ rotation
-
-
-def test_a_state_holds_springs_vertical_and_moment():
-    """A straight hanging arm has no moment; one that is tilted has it about the axis of the tilt."""
-    straight = np.zeros(3 * SPEC.n_links, np.float32)
-    hanging = frames_and_sections(straight)[1]
-    np.testing.assert_allclose(hanging.state[:, :3], 4.0, rtol=1e-6)
-    np.testing.assert_allclose(hanging.state[:, 3:], [[0, 0, 1, 0, 0, 0]] * 3, atol=1e-6)
-    bent = np.where(np.arange(len(straight)) == 1, np.float32(0.3), straight)
-    moments = np.asarray(frames_and_sections(bent)[1].state[:, 6:])
-    assert np.all(np.abs(moments[:, 0]) > 10.0 * np.abs(moments[:, 1:]).max())
-    assert np.all(np.diff(np.abs(moments[:, 0])) < 0.0)  # less weight below
