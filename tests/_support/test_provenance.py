@@ -30,14 +30,11 @@ def test_code_that_is_not_committed_is_told_and_other_results_are_not(checkout):
     assert provenance("a")["uncommitted_changes"] is True
 
 
-def test_another_repository_around_an_installed_package_is_not_told(checkout, monkeypatch):
+def test_without_a_repository_of_the_package_there_is_no_commit(checkout, tmp_path_factory, monkeypatch):
+    """Another repository around an installed package, and none at all."""
     (checkout / "installed.py").write_text("1")
-    monkeypatch.setattr(module, "__file__", str(checkout / "installed.py"))
-    assert provenance("a")["commit"] is None and provenance("a")["uncommitted_changes"] is None
-
-
-def test_without_a_repository_there_is_no_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "code.py"))
-    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    told = provenance("a")
-    assert told["commit"] is None and told["uncommitted_changes"] is None
+    nowhere = tmp_path_factory.mktemp("nowhere")
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(nowhere.parent))
+    for file in (checkout / "installed.py", nowhere / "code.py"):
+        monkeypatch.setattr(module, "__file__", str(file))
+        assert provenance("a")["commit"] is None and provenance("a")["uncommitted_changes"] is None

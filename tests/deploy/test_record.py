@@ -185,9 +185,13 @@ class Noisy(Seen):
         return Capture(tip_m, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
 
 
-def test_a_recording_ends_where_more_poses_bring_nothing(monkeypatch):
+@pytest.fixture
+def checked_early(monkeypatch):
     monkeypatch.setattr(recording, "MIN_POSES", 10)
     monkeypatch.setattr(recording, "CHECK_POSES", 5)
+
+
+def test_a_recording_ends_where_more_poses_bring_nothing(checked_early):
     lines = []
     result = record(Noisy(), SPEC, growing(random_pressures(SPEC, 60, 3)), tell=lines.append)
     assert result.n_poses < 60 and result.ending == Ending()
@@ -207,9 +211,7 @@ class Restless(Seen):
         return Capture(self.spring_m[:3] + off_m, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
 
 
-def test_a_pose_that_never_rests_is_no_second_check(monkeypatch):
-    monkeypatch.setattr(recording, "MIN_POSES", 10)
-    monkeypatch.setattr(recording, "CHECK_POSES", 5)
+def test_a_pose_that_never_rests_is_no_second_check(checked_early, monkeypatch):
     monkeypatch.setattr(recording, "prediction_errors_mm", lambda poses, spec: (1.0, 1.0))
     targets_kpa = growing(random_pressures(SPEC, 30, 3))
     result = record(Restless(targets_kpa[10]), SPEC, targets_kpa)
@@ -219,9 +221,6 @@ def test_a_pose_that_never_rests_is_no_second_check(monkeypatch):
 def test_recording_stops_and_vents_when_readings_are_lost():
     arm = Blind(range(450, 10**6), nan)
     result = record(arm, SPEC, random_pressures(SPEC, 50, 3))
-    assert (
-        "got 3 lost readings in a row, expected under 3: spring4: got nan Hz" in result.ending.cause
-        and result.ending.status == 3
-    )
+    assert "got 3 lost readings in a row" in result.ending.cause and result.ending.status == 3
     assert 0 < result.n_poses < 50
     np.testing.assert_array_equal(arm.command_kpa, 0.0)

@@ -10,7 +10,6 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.spec import ArmSpec
 
 REFUSED = [
-    ({"engine": "mujoco"}, r"EnvConfig\.engine: got 'mujoco', expected one of"),
     ({"mode": "static"}, r"EnvConfig\.mode: got 'static', expected one of"),
     ({"observation": "motion"}, "got 'motion', expected 'pose' or 'payload' for arms at rest"),
     ({"engine": "mjx-step"}, "engine: got 'mjx-step', expected one of .*'mjx', 'chain'"),

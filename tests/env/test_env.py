@@ -95,13 +95,6 @@ def test_every_goal_is_reached_to_a_tenth_of_a_millimetre_with_no_chamber_satura
     np.testing.assert_array_equal(after.metrics["reached"], 1)
 
 
-def test_the_same_key_gives_the_same_episode_and_another_key_another_one(reset, step, random_actions):
-    first, again, other = (step(reset(seed), random_actions) for seed in (5, 5, 6))
-    assert leaves_equal(first, again)
-    assert not np.array_equal(first.pipeline_state.goal, other.pipeline_state.goal)
-    assert not np.array_equal(first.obs, other.obs)
-
-
 def test_observation_is_scaled_pose_scaled_goal_and_error(start, step, random_actions):
     for state in (start, step(start, random_actions)):
         pose, goal = (np.float64(x) for x in (state.pipeline_state.pose, state.pipeline_state.goal))

@@ -41,26 +41,6 @@ def test_gymnasium_s_checker_has_nothing_to_say(arm):
     check_env(arm)
 
 
-def test_make_adds_the_time_limit_and_the_passive_checks(arm):
-    env = gymnasium.make(ENV_ID, config=CONFIG)
-    assert env.spec.max_episode_steps == EPISODE_LENGTH
-    assert env.unwrapped._step_arm is arm._step_arm  # compiled once
-    env.reset(seed=0)
-    action = np.asarray(arm.env.action_of(np.full(9, 0.17, np.float32)))
-    steps = [env.step(action) for _ in range(EPISODE_LENGTH)]
-    assert [(terminated, truncated) for _, _, terminated, truncated, _ in steps] == [(False, False)] * (
-        EPISODE_LENGTH - 1
-    ) + [(False, True)]
-
-
-def test_an_action_that_is_nan_truncates_without_a_reward_and_is_marked(arm):
-    before, _ = arm.reset(seed=2)
-    obs, reward, terminated, truncated, info = arm.step(np.full(9, np.nan, np.float32))
-    assert (reward, terminated, truncated) == (0.0, False, True)
-    assert info["valid"] is False and info["unsettled"] == 1.0 and info["is_success"] is False
-    np.testing.assert_array_equal(obs, before)
-
-
 @pytest.mark.parametrize("make", [lambda: SoftArmEnv(config=CONFIG), lambda: SoftArmVectorEnv(config=CONFIG)])
 def test_a_step_before_the_first_reset_is_refused(make):
     env = make()
@@ -145,24 +125,6 @@ def test_an_arm_at_its_goal_terminates_and_the_others_go_on(envs):
     assert not truncated.any()
     np.testing.assert_array_equal(infos["_final_obs"], terminated)
     np.testing.assert_array_equal(infos["_tip_error_mm"], ~terminated)
-
-
-def test_an_arm_that_cannot_settle_is_reset_and_marked_while_the_others_go_on(envs):
-    first, _ = envs.reset(seed=7)
-    actions = still(envs)
-    actions[3, 5] = np.nan
-    obs, reward, terminated, truncated, infos = envs.step(actions)
-    failed = np.arange(N_ARMS) == 3
-    np.testing.assert_array_equal(truncated, failed)
-    assert not terminated.any() and reward[3] == 0.0
-    final = infos["final_info"]
-    assert not final["valid"][3] and final["unsettled"][3] == 1.0
-    np.testing.assert_array_equal(infos["final_obs"][3], first[3])
-    np.testing.assert_array_equal(infos["valid"], ~failed)
-    assert np.isfinite(obs).all()
-    assert not np.array_equal(obs[3, 6:12], first[3, 6:12])  # a new goal
-    *_, infos = envs.step(still(envs))
-    assert infos["valid"].all()
 
 
 def test_make_vec_gives_the_vector_environment_with_the_registered_time_limit():

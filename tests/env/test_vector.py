@@ -104,12 +104,3 @@ def test_a_new_episode_has_its_full_length():
     truncated = np.array([outcome.truncated for _, _, outcome in history])
     np.testing.assert_array_equal(np.flatnonzero(truncated[:, 0]), [3])  # one step later than
     np.testing.assert_array_equal(np.flatnonzero(truncated[:, 1]), [2, 5])
-
-
-def test_new_episodes_follow_from_the_key_and_differ_from_arm_to_arm():
-    arms = VectorEnv(ObedientEnv(), 3, EPISODE_LENGTH)
-    start = arms.reset(jax.random.key(0))
-    action = jnp.full((3, 1), REACH)
-    first, again, other = (arms.step(start, action, jax.random.key(seed))[0].obs for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert len(set(np.asarray(jnp.concatenate([start.obs, first, other])[:, 0]))) == 9

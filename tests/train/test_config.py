@@ -29,7 +29,6 @@ ALL_PRESETS = PRESETS | IMITATION_PRESETS
 @pytest.mark.parametrize(
     "preset, assignment, message",
     [
-        ("quick", "seed", "seed: got 'seed', expected NAME=VALUE"),
         ("quick", "sed=1", "sed: got 'sed=1', expected NAME=VALUE for one of learner, seed"),
         ("quick", "seed=one", "seed: got 'one', expected int"),
         ("quick", "learner.n_arms=0", "learner.n_arms: got 0, expected a whole number >= 1"),
@@ -47,7 +46,6 @@ ALL_PRESETS = PRESETS | IMITATION_PRESETS
         ("payload", "env.randomisation.payload_max_kg=0.5", "payload_max_kg: got 0.5 "),
         ("pipe", "env.observation=payload", "env.observation: got 'payload', expected 'pose'"),
         ("pipe", "env.mode=dynamic", "env.mode: got 'dynamic', expected 'quasistatic'"),
-        ("pipe", 'learner.stages=[{"part": 1.0}]', "settings"),
         ("pipe", 'learner.stages=[{"share": 0.5}]', "expected shares that add up to 1, not 0.5"),
         ("pipe", 'learner.stages=[{"share": 1.0, "every": 0}]', "every: got 0"),
         ("pipe", "learner.expert_share=1.0", "expert_share: got 1.0"),

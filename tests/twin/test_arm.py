@@ -80,20 +80,6 @@ def test_ideal_twins_of_other_arms_rest_where_settle_says(other_arm):
     np.testing.assert_allclose(read_m, expected.spring_m[0], atol=2e-5)
 
 
-@pytest.mark.parametrize("kind", [Twin, RodTwin])
-def test_twins_of_other_arms_are_as_unlike_as_the_paper_s(kind, other_arm):
-    """Every chamber, spring and section has its own deviation; markers lie at thirds of each section."""
-    arm, ideal = (kind(3, other_arm, build=Build(gap=gap, noise=0.0)) for gap in (1.9, 0.0))
-    readings = arm.read_sensors()
-    assert readings.shape == (other_arm.n_springs,) and (readings != ideal.read_sensors()).all()
-    assert arm.pressures().shape == (other_arm.n_chambers,)
-    off_m = np.linalg.norm(arm.motion_capture().tip_m - ideal.motion_capture().tip_m)
-    assert 2e-3 < off_m < 0.05
-    length_m = np.diff(ideal.motion_capture().marker_m[2::3, 2], prepend=0.0)
-    stretched = -length_m / other_arm.per_section(other_arm.geometry.section_length_m)
-    np.testing.assert_allclose(stretched, 1.05, atol=0.05)  # by the weight below
-
-
 def test_twisted_mounting_turns_the_sections_and_stretches_nothing(spec):
     twist_rad = np.array([0.1, 0.2, -0.05])
     parts = draw_parts(0, spec, Build(gap=0.0))._replace(twist_rad=twist_rad)
@@ -215,9 +201,9 @@ def test_survives_random_extremes():
 
 
 def test_payload_in_a_name():
-    named = [open_arm(f"twin:{name}:500g").motion_capture().tip_m for name in ("3", "rod:3")]
-    loaded = [kind(3, payload_kg=0.5).motion_capture().tip_m for kind in (Twin, RodTwin)]
-    np.testing.assert_array_equal(named, loaded)
+    for name, kind in (("3", Twin), ("rod:3", RodTwin)):
+        named_m = open_arm(f"twin:{name}:500g").motion_capture().tip_m
+        np.testing.assert_array_equal(named_m, kind(3, payload_kg=0.5).motion_capture().tip_m)
     in_pipe = open_arm("twin:7:pipe300:220g")
     lower_m = open_arm("twin:7:pipe300").motion_capture().tip_m - in_pipe.motion_capture().tip_m
     assert lower_m[2] > 1e-3 and in_pipe._pipe is not None
@@ -238,7 +224,10 @@ def test_a_twin_of_another_arm_by_name(kind, tmp_path):
         open_arm(f"twin:{kind}7@absent.toml")
 
 
-@pytest.mark.parametrize("kind", ["", "rod:"])
+both_kinds = pytest.mark.parametrize("kind", ["", "rod:"])
+
+
+@both_kinds
 def test_an_exact_twin_has_the_specified_parts(kind):
     """Without noise, springs read the same in all of them, as those of the specification do."""
     lengths_m = [open_arm(f"twin:{kind}{seed}:exact")._lengths_m() for seed in (1, 2)]
@@ -248,7 +237,7 @@ def test_an_exact_twin_has_the_specified_parts(kind):
     np.testing.assert_array_equal(sensor.delta_m, specified.delta_m)
 
 
-@pytest.mark.parametrize("kind", ["", "rod:"])
+@both_kinds
 def test_an_aged_twin_is_the_same_arm_with_shifted_zeros_and_softer_chambers(kind):
     """The shift alone shows at no pressure; the load on softer chambers lengthens the springs a little."""
     young, aged = (open_arm(f"twin:{kind}3{age}") for age in ("", ":aged"))
@@ -261,7 +250,7 @@ def test_an_aged_twin_is_the_same_arm_with_shifted_zeros_and_softer_chambers(kin
     assert open_arm(f"twin:{kind}3:aged:100g").motion_capture().tip_m[2] < aged.motion_capture().tip_m[2]
 
 
-@pytest.mark.parametrize("kind", ["", "rod:"])
+@both_kinds
 def test_a_twin_may_have_lost_a_chamber(kind):
     whole, arm = (open_arm(f"twin:{kind}3{lost}") for lost in ("", ":lost4"))
     for _ in range(100):

@@ -11,10 +11,7 @@ from mjx_softarm.twin.instruments import EVALUATION_SESSION, S2R_SESSION, Build
 from mjx_softarm.twin.rod_twin import RodTwin
 
 KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
-KINDS = {
-    "twin": (Twin, partial(Build, per_section=4)),
-    "rod": (RodTwin, partial(Build, per_section=3)),
-}
+KINDS = {"twin": (Twin, partial(Build, per_section=4)), "rod": (RodTwin, partial(Build, per_section=3))}
 both_kinds = pytest.mark.parametrize(("make", "build"), KINDS.values(), ids=KINDS)
 
 
@@ -38,20 +35,16 @@ def test_seed_chooses_the_arm_and_session_the_noise(make, build):
 
 
 @both_kinds
-@pytest.mark.parametrize("payload_kg", [-0.1, np.nan, np.inf])
-def test_impossible_payload_is_refused(make, build, payload_kg):
-    with pytest.raises(ValueError, match=r"payload_kg: got .*, expected a number >= 0"):
-        make(0, payload_kg=payload_kg, build=build())
-
-
-@both_kinds
-def test_impossible_commands_are_refused_and_nothing_moves(make, build):
+def test_impossible_payloads_and_commands_are_refused_and_nothing_moves(make, build):
+    for payload_kg in (-0.1, np.nan):
+        with pytest.raises(ValueError, match=r"payload_kg: got .*, expected a number >= 0"):
+            make(0, payload_kg=payload_kg, build=build())
     arm = make(0, build=build())
     for command, message in (
         (np.zeros(8), r"pressure_kpa: got shape \(8,\), expected \(9,\)"),
-        ([0, 0, np.nan, 0, 0, 0, 0, 0, 0], r"pressure_kpa\[2\]: got nan, expected -40 to 20 kPa"),
-        ([0, 0, 0, 20.1, 0, 0, 0, 0, 0], r"pressure_kpa\[3\]: got 20.1, expected -40 to 20 kPa"),
-        ([-40.1, 0, 0, 0, 0, 0, 0, 0, 0], r"pressure_kpa\[0\]: got -40.1, expected -40 to 20 kPa"),
+        (np.where(np.arange(9) == 2, np.nan, 0.0), r"pressure_kpa\[2\]: got nan, expected -40 to 20 kPa"),
+        (np.where(np.arange(9) == 3, 20.1, 0.0), r"pressure_kpa\[3\]: got 20.1"),
+        (np.full(9, -40.1), r"pressure_kpa\[0\]: got -40.1"),
     ):
         with pytest.raises(ValueError, match=message):
             arm.write_pressures(command)

@@ -4,18 +4,7 @@ import time
 
 import numpy as np
 
-from tests.view.conftest import taken, wait_for
-
-
-def test_channel_keeps_the_newest_of_each_name(ends):
-    end, other = ends
-    other.send({"goal": 1})
-    other.send({"vent": True, "goal": 2})
-    other.send({"goal": 3, "last": True})
-    assert taken(end, "last") == {"vent": True, "goal": 3, "last": True} and end.take() == {}
-    end.put(look=1, doing="x")
-    wait_for(other.poll)
-    assert other.recv() == {"look": 1, "doing": "x"}
+from tests.view.conftest import wait_for
 
 
 def test_other_end_that_reads_nothing_costs_no_time_and_no_memory(ends):

@@ -33,33 +33,32 @@ def inbox():
     return Inbox()
 
 
+@pytest.fixture
+def pilot(inbox):
+    """A pilot of a real arm."""
+    return PagePilot(inbox, SimpleNamespace(), CONTROLLER, lambda text: None)
+
+
 def ask(pilot, inbox, **asked):
     inbox.asked = asked
     return pilot.orders()
 
 
-def real_arm():
-    return SimpleNamespace()
-
-
-def test_goals_are_obeyed_once_somebody_asks_for_motion(inbox):
-    pilot = PagePilot(inbox, real_arm(), CONTROLLER, lambda text: None)
+def test_goals_are_obeyed_once_somebody_asks_for_motion(pilot, inbox):
     assert ask(pilot, inbox, goal=GOALS[0]) is None
     assert ask(pilot, inbox, follow=True) is None
     np.testing.assert_array_equal(ask(pilot, inbox, goal=GOALS[0]), GOALS[:1])
     assert len(ask(pilot, inbox, circle=True)) >= 40
 
 
-def test_goals_are_clamped(inbox):
-    pilot = PagePilot(inbox, real_arm(), CONTROLLER, lambda text: None)
+def test_goals_are_clamped(pilot, inbox):
     (goal,) = ask(pilot, inbox, follow=True, goal=FAR)
     assert with_goal(CONTROLLER, start(CONTROLLER), FAR)[1]
     assert with_goal(CONTROLLER, start(CONTROLLER), goal)[1] == ()
 
 
 @pytest.mark.parametrize("button", ["hold", "vent"])
-def test_stop_and_vent_stand_against_a_flood_of_goals(inbox, button):
-    pilot = PagePilot(inbox, real_arm(), CONTROLLER, lambda text: None)
+def test_stop_and_vent_stand_against_a_flood_of_goals(pilot, inbox, button):
     ask(pilot, inbox, follow=True)
     orders = ask(pilot, inbox, goal=GOALS[0], follow=True, circle=True, **{button: True})
     assert orders == button
@@ -69,7 +68,7 @@ def test_stop_and_vent_stand_against_a_flood_of_goals(inbox, button):
 
 def test_closed_page_and_dead_server_are_told(inbox):
     lines = []
-    pilot = PagePilot(inbox, real_arm(), CONTROLLER, lines.append)
+    pilot = PagePilot(inbox, SimpleNamespace(), CONTROLLER, lines.append)
     ask(pilot, inbox, pages=1)
     assert ask(pilot, inbox, pages=0) is None and "no page is open" in lines[-1]
     inbox.closed = SimpleNamespace(is_set=lambda: True)
@@ -77,9 +76,12 @@ def test_closed_page_and_dead_server_are_told(inbox):
     assert ask(pilot, inbox) is None and len(lines) == 2
 
 
-def test_picking_and_placing_hangs_a_mass_to_the_gripper_and_takes_it_off(inbox):
-    arm, loads = SimpleNamespace(), []
-    arm.attach = loads.append
+def test_payloads_and_picking_and_placing_hang_a_mass_to_the_gripper_and_take_it_off(inbox):
+    loads = []
+    arm = SimpleNamespace(attach=loads.append)
+    ask(PagePilot(inbox, arm, CONTROLLER, lambda text: None), inbox, payload_kg=0.25)
+    assert loads == [0.25]
+    loads.clear()
     pilot = PagePilot(inbox, arm, CONTROLLER, lambda text: None)
     goals = ask(pilot, inbox, place=True)[:6]
     state, row, held = start(CONTROLLER), {"time_s": 0.0}, []
@@ -93,13 +95,6 @@ def test_picking_and_placing_hangs_a_mass_to_the_gripper_and_takes_it_off(inbox)
     ask(pilot, inbox, goal=GOALS[0])  # somebody drags the goal in between
     pilot.look(state._replace(arrived=True), row)
     assert len(loads) == 2
-
-
-def test_payload_is_attached(inbox):
-    arm, loads = SimpleNamespace(), []
-    arm.attach = loads.append
-    ask(PagePilot(inbox, arm, CONTROLLER, lambda text: None), inbox, payload_kg=0.25)
-    assert loads == [0.25]
 
 
 class Timed(PagePilot):

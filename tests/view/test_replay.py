@@ -62,10 +62,8 @@ def test_command_line(path, tmp_path, capsys):
     (tmp_path / "other").mkdir()
     for words, message in (
         (("--html", tmp_path / "a.html"), "--html: got no log, expected one or more"),
-        ((path, "--html", tmp_path / "no" / "a.html"), "expected a file in a folder that exists"),
-        ((path, "--html", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .html or .htm"),
-        (("--demos", tmp_path / "a.mcap"), "a.mcap, expected a name that ends in .csv or .npz"),
-        ((tmp_path / "no.csv",), "no.csv"),
+        ((path, "--html", tmp_path / "a.xlsx"), "expected a name that ends in .html or .htm"),
+        (("--demos", tmp_path / "a.mcap"), "expected a name that ends in .csv or .npz"),
         ((tmp_path / "other",), "other: got 'Is a directory', expected a log"),
     ):
         assert main([*map(str, words)]) == 2

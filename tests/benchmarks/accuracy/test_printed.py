@@ -5,9 +5,8 @@ import json
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.accuracy.printed import CASES, PRESETS, curves, final_figures, run_name
+from benchmarks.accuracy.printed import curves, final_figures
 from benchmarks.harness import common
-from train.config import override
 from train.presets import IMITATION_PRESETS
 
 
@@ -17,13 +16,6 @@ def course(success, median_mm):
     for row, share in zip(rows[2::3], success, strict=True):
         row |= {"evaluation/success_share": share, "evaluation/median_mm": median_mm}
     return rows
-
-
-def test_every_case_is_a_preset_of_the_paper_with_other_settings():
-    names = [run_name(name, 0) for name in CASES]
-    assert len(set(names)) == len(names)
-    configs = [override(IMITATION_PRESETS[PRESETS[c.task]], c.settings) for c in CASES.values()]
-    assert len(set(configs)) == len(configs)
 
 
 def test_the_paper_s_recipe_is_as_printed():

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-from contextlib import closing
 from types import SimpleNamespace
 
 import jax
@@ -10,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.harness.rounds import ROOT, Worker
-from benchmarks.speed.soromox_worker import HELD_S, N_STEPS, random_forces, section_matrices, stepper
-from benchmarks.speed.throughput import SOROMOX
+from benchmarks.harness.rounds import ROOT
+from benchmarks.speed.soromox_worker import N_STEPS, random_forces, section_matrices, stepper
 from mjx_softarm import ArmSpec
-from mjx_softarm.env import EnvConfig
 
 SPEC = ArmSpec.default()
 PYTHON = ROOT / ".venv-soromox" / "bin" / "python"
@@ -80,20 +77,6 @@ def test_the_implicit_step_rests_where_an_explicit_one_diverges():
         ends[method] = np.asarray(state)
     np.testing.assert_allclose(ends["implicit"][0], 0.5, atol=1e-3)
     assert not np.isfinite(ends["explicit"]).all()
-
-
-def test_the_implicit_step_is_as_long_as_mjx_s_and_every_method_has_a_row():
-    assert HELD_S / N_STEPS["implicit"] == pytest.approx(EnvConfig().simulation_step_s)
-    assert EnvConfig().dynamic_step_s == HELD_S and SOROMOX.keys() == N_STEPS.keys()
-
-
-@pytest.mark.skipif(not PYTHON.exists(), reason="the environment of SoRoMoX is not made")
-def test_arms_of_soromox_move_and_stay_finite():
-    program = ["benchmarks.speed.soromox_worker", "implicit", "4"]
-    with closing(Worker("SoRoMoX", program, PYTHON)) as worker:
-        worker.start()
-        assert worker.facts == {"arms": 4, "step_ms": 20.0}
-        assert worker.round()["simulated_s_per_s"] > 0.0
 
 
 @pytest.mark.skipif(not PYTHON.exists(), reason="the environment of SoRoMoX is not made")

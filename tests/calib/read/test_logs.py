@@ -20,16 +20,8 @@ def test_clean_log_comes_back_without_findings(file, name, seed):
     assert findings == []
     expected = arm_log(**changes)
     np.testing.assert_array_equal(log.row, expected.row)
-    for group in [
-        "time_s",
-        "readings",
-        "spring_m",
-        "tip_m",
-        "tip_quaternion",
-        "marker_m",
-        "payload_kg",
-        "sequence",
-    ]:
+    groups = "time_s readings spring_m tip_m tip_quaternion marker_m payload_kg sequence"
+    for group in groups.split():
         np.testing.assert_allclose(getattr(log, group), getattr(expected, group), rtol=1e-8, atol=1e-9)
     assert log.goal is None and log.estimate is None and log.reference_m is None
 

@@ -114,7 +114,6 @@ def test_gaps_and_constant_columns_are_reported_alone(file):
         ("frequency0", "MHz", "Hz", "frequency0"),
         ("pressure", "Pa", "kPa", "pressure0"),
         ("pressure", "kPa", "Pa", "pressure_kpa"),
-        ("tip_z", "m", "mm", "tip_z"),
         ("tip", "cm", "mm", "tip_m"),
         ("payload", "kg", "g", "payload_kg"),
         ("time", "ms", "s", "time"),

@@ -8,13 +8,7 @@ import pytest
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy import capture
-from tests.deploy.capture.scene import (
-    POSE,
-    SYSTEMS,
-    look,
-    missed,
-    scene_of,
-)
+from tests.deploy.capture.scene import POSE, SYSTEMS, look, missed, scene_of
 from tests.deploy.capture.servers import QualisysServer
 
 

@@ -76,12 +76,18 @@ def serve(controller):
 
 
 @pytest.fixture
-def line(request):
+def driven(request):
+    """The driver's class, and the microcontroller at the other end of its line."""
     pytest.importorskip("serial")
     controller = Controller()
     kind, end = serve(controller)
     request.addfinalizer(end)
-    return kind(), controller
+    return kind, controller
+
+
+@pytest.fixture
+def line(driven):
+    return driven[0](), driven[1]
 
 
 @pytest.mark.parametrize(("spec", "n_springs"), [(SPEC, 0), (SIX_CHAMBERS, 9)])
@@ -130,11 +136,8 @@ def test_what_the_arm_refuses_is_an_error_and_what_it_garbles_is_lost(line):
     assert arm.read_sensors().min() > 1e6
 
 
-def test_board_that_begins_anew_is_waited_for(request, monkeypatch):
-    pytest.importorskip("serial")
-    controller = Controller()
-    kind, end = serve(controller)
-    request.addfinalizer(end)
+def test_board_that_begins_anew_is_waited_for(driven, monkeypatch):
+    kind, controller = driven
     kind.timeout_s, controller.silent = 0.05, 4
     assert kind().read_sensors().min() > 1e6 and controller.silent == 0
     monkeypatch.setattr(serial_line, "START_S", 0.2)
@@ -155,12 +158,9 @@ def test_line_that_cannot_be_sent_in_time_is_lost(monkeypatch):
         os.close(end)
 
 
-def test_an_arm_by_its_settings(request, tmp_path):
-    pytest.importorskip("serial")
-    kind, end = serve(Controller())
-    request.addfinalizer(end)
+def test_an_arm_by_its_settings(driven, tmp_path):
     file = tmp_path / "wiring.toml"
-    file.write_text(f"[arm]\ndriver = 'serial'\nport = '{kind.port}'\nn = {N}\ntimeout_s = 0.5\n")
+    file.write_text(f"[arm]\ndriver = 'serial'\nport = '{driven[0].port}'\nn = {N}\ntimeout_s = 0.5\n")
     arm = open_arm(str(file))
     assert arm.read_sensors().min() > 1e6 and len(arm.pressures()) == N
 
@@ -170,11 +170,7 @@ def test_an_arm_by_its_settings(request, tmp_path):
     [
         ("[arm", "expected a TOML file"),
         ("[springs]", "got .*springs.*, expected the table arm"),
-        ("[arm]\ndriver = 'usb'", "got .*'usb'.*, expected the table arm with driver = \"serial\""),
-        (
-            "[arm]\ndriver = 'serial'\nsend = 1",
-            "got send, expected some of port, baud, n, ",
-        ),
+        ("[arm]\ndriver = 'serial'\nsend = 1", "got send, expected some of port, "),
         ("[arm]\ndriver = 'serial'\nport = '/dev/ttyNONE'", "got SerialException: .*/dev/ttyNONE"),
     ],
 )

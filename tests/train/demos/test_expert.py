@@ -10,16 +10,8 @@ from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import pose_from_frame
 from tests.mechanics.test_fidelity import FAST_GAINS, fast_model, stepped_to_rest
-from train.demos.expert import (
-    EASED,
-    LIMIT_SHARE,
-    MARGIN_KPA,
-    MARGIN_M,
-    SPRING_MARGIN_M,
-    TOLERANCE_RAD,
-    WAY,
-    ExpertError,
-)
+from train.demos import expert as module
+from train.demos.expert import LIMIT_SHARE, MARGIN_KPA, MARGIN_M, SPRING_MARGIN_M, WAY, ExpertError
 from train.demos.waypoints import FREE, SQUARE, TASKS, Waypoint, circle, task
 
 PIPE = CrossPipe.of_mm(300)
@@ -88,14 +80,8 @@ def test_look_tells_what_is_not_in_the_pipe(expert, spec):
 @pytest.mark.parametrize(
     ("finger_m", "message"),
     [
-        (
-            [0.4, 0.0, -0.6],
-            r"waypoint 'far' at 400, 0, -600 mm: got at best .* mm off.* from the wall, chamber \d at",
-        ),
-        (
-            [0.0, 0.13, -0.4],
-            r"waypoint 'far' at 0, 130, -400 mm: got at best .* mm from the wall",
-        ),  # in the wall
+        ([0.4, 0.0, -0.6], r"waypoint 'far' at 400, 0, -600 mm: got at best .* mm off.* chamber \d at"),
+        ([0.0, 0.13, -0.4], "waypoint 'far' .* got at best .* mm from the wall"),  # in the wall
     ],
 )
 def test_waypoint_that_cannot_be_met_is_named(expert, finger_m, message):
@@ -109,7 +95,7 @@ def test_gripper_that_cannot_hang_as_asked_hangs_a_little_otherwise(expert, spec
     found = expert.reach("edge", expert.target(Waypoint("edge", finger_m, SQUARE)), np.zeros(spec.n_chambers))
     turn = found.rotation.T - found.rotation
     turn_rad = np.linalg.norm([turn[2, 1], turn[0, 2], turn[1, 0]]) / 2
-    assert TOLERANCE_RAD < turn_rad < TOLERANCE_RAD / EASED
+    assert module.TOLERANCE_RAD < turn_rad < module.TOLERANCE_RAD / module.EASED
     np.testing.assert_allclose(found.finger_m, finger_m, atol=5e-4)
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     assert np.minimum(found.pressure_kpa - low, high - found.pressure_kpa).min() >= LIMIT_SHARE * MARGIN_KPA
@@ -130,7 +116,6 @@ def test_tasks_have_the_papers_positions(spec):
         for waypoint in named:
             place = pipe.containers()[waypoint.name.split(" ")[1]]
             np.testing.assert_allclose(waypoint.finger_m, place, atol=1e-9)
-        assert [waypoints[k].name for k in (0, -1)] == ["home", "home"]
         moves_m = np.linalg.norm(np.diff([waypoint.finger_m for waypoint in waypoints], axis=0), axis=1)
         assert moves_m.min() > 0.025 and moves_m.max() < 0.09
 

@@ -198,13 +198,9 @@ def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monke
 def test_misuse_is_told_before_anything_moves(command, tmp_path):
     (tmp_path / "arm.csv").touch()
     for args, message in (
-        ((*RECORD, tmp_path / "x.csv"), "--task {circle16,pipe300,pipe250,"),
         ((*RECORD, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected a file in a folder that"),
         ((*RECORD, tmp_path / "arm.csv", "--task", "pipe300"), "arm.csv, which is there already, expected"),
-        (
-            (*RECORD, tmp_path / "x.xlsx", "--task", "pipe300"),
-            "x.xlsx, expected a name that ends in .csv or .npz",
-        ),
+        ((*RECORD, tmp_path / "x.xlsx", "--task", "pipe300"), "expected a name that ends in .csv or .npz"),
         (("check", tmp_path / "none.csv"), "none.csv: got 'No such file"),
     ):
         status, printed = command(*args)

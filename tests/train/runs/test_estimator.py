@@ -21,13 +21,7 @@ from mjx_softarm.sensing.estimator import POSE_ERROR_MM, estimate_frame, expecte
 from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.pose import frame_from_pose
 from train.runs import estimator as module
-from train.runs.estimator import (
-    PAYLOADS,
-    distil,
-    fit_load_estimator,
-    fit_pose,
-    loaded_poses,
-)
+from train.runs.estimator import PAYLOADS, distil, fit_load_estimator, fit_pose, loaded_poses
 
 SPEC = ArmSpec.default()
 N, N_ARMS = SPEC.n_chambers, 512
@@ -157,11 +151,8 @@ def test_lost_chambers_are_found(distilled, pool, payload_kg, share):
 @pytest.mark.parametrize("name", ["the paper's", "mounted", "four-chamber"])
 def test_poses_are_within_a_tenth_of_a_millimetre(name):
     """Arms of all payloads, one of them with a tilted base and a tip beside the plate."""
-    mounting = {
-        "base_turn_deg": (3.0, -2.0, 5.0),
-        "tip_offset_m": (0.01, 0.0, -0.03),
-        "tip_turn_deg": (4.0, 0.0, 9.0),
-    }
+    mounting = {"base_turn_deg": (3.0, -2.0, 5.0), "tip_turn_deg": (4.0, 0.0, 9.0)}
+    mounting["tip_offset_m"] = (0.01, 0.0, -0.03)
     arms = {"mounted": SPEC.replace(mounting=mounting), "four-chamber": ArmSpec.of(Path("four-chamber"))}
     spec = arms.get(name, SPEC)
     estimator = fit_pose(spec, 0)

@@ -53,19 +53,12 @@ def test_positions_are_evaluated_with_body_and_pressures(short_env, evaluator, s
     assert (np.isinf(at.reached.clearance_mm) if pipe_mm is None else at.reached.clearance_mm < 0.0).all()
 
 
-def test_success_at_the_first_stages_positions_has_figures_of_its_own():
-    zero, poses = np.zeros(3), np.zeros((3, 6))
-    reached = Reached(poses, poses, zero, zero, zero == 0, zero, np.array([5.0, -1, -1]), zero)
-    figures, _ = summarise(reached, 0.03, np.array([True, True, False]))
-    assert (figures.success_share, figures.success_first_share) == (pytest.approx(1 / 3), 0.5)
-    assert figures.outside_positions == 2
-
-
 def test_positions_with_saturation_or_a_body_outside_are_counted():
     zero, poses = np.zeros(4), np.zeros((4, 6))
     saturated, clearance_mm = np.array([0, 2, 0, 0]), np.array([5.0, 5, -1, 5])
     settled = np.array([True, True, True, False])
     reached = Reached(poses, poses, zero, saturated, settled, zero, clearance_mm, zero)
-    figures, at = summarise(reached, 0.03, np.ones(4, bool))
+    figures, at = summarise(reached, 0.03, np.array([True, True, False, False]))
     assert (figures.saturated_positions, figures.outside_positions, figures.unsettled) == (1, 1, 1)
     assert figures.success == (True, False, False, False) == tuple(at.success)
+    assert (figures.success_share, figures.success_first_share) == (0.25, 0.5)  # of all, of the first stage
