@@ -19,7 +19,8 @@ demo: $(INSTALLED)  ## train a small policy, show its figures, draw its pictures
 	@run=$$(ls -dt runs/reach-quick-seed0* | head -1); $(BIN)/python -m train export "$$run" && \
 	{ $(BIN)/python -m mjx_softarm.deploy measure "$$run/policy.npz" --arm twin:0:exact --points 40 --seconds 20 \
 	  --out "$$run/twin" || [ $$? -eq 1 ]; } && \
-	$(BIN)/python -m mjx_softarm.view "$$run/twin/log.npz" --html "$$run/twin.html"
+	$(BIN)/python -m mjx_softarm.view "$$run/twin/log.npz" --html "$$run/twin.html" && \
+	echo "next: open $$run/twin.html in a browser; put your own arm to work by docs/your-arm.md"
 
 # A file's tests share compiled functions, so they stay in one process.
 test: $(INSTALLED)  ## the tests, on up to four cores

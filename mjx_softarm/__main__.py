@@ -132,11 +132,11 @@ def _tell_lengths(spec: ArmSpec, spring_m: np.ndarray) -> None:
         reached = np.array([parts[k].min(), parts[k].max()])
         limits = np.array([spec.per_section(low_m)[k], spec.per_section(high_m)[k]])
         far = np.abs(limits - reached).max() > FAR_LIMIT * np.ptp(reached)
-        (shortest, longest), (low, high) = 1e3 * reached, 1e3 * limits
+        (shortest, longest), (low, high) = reached, limits
         print(
-            f"springs{f' of section {k}' * (n > 1)}: {shortest:.0f} to {longest:.0f} mm; "
-            f"springs.length_min_m and length_max_m: {low:.0f} to {high:.0f} mm"
-            + ", expected about what they reach"
+            f"springs{f' of section {k}' * (n > 1)}: springs.length_min_m = {shortest:.3f} and "
+            f"length_max_m = {longest:.3f} would hold what they reach; now {low:.3f} and {high:.3f}"
+            + ": change them"
             * bool(far)
         )
 

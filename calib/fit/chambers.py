@@ -49,7 +49,7 @@ from mjx_softarm.mechanics.workspace import pressure_levels
 from mjx_softarm.spec import BONDS, ArmSpec
 
 MIN_POSES = 20
-ENOUGH_POSES = 100
+ENOUGH_POSES = 60  # circles of six stand-ins within 1.2 mm; docs/results/arms-minutes.json
 MIN_STRAIGHT = 20  # poses of straight arms from which their errors have scales of their own
 HELD_OUT_BLOCK = 5  # poses
 SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # first guess for tip [m], rotation [rad], springs [m] and markers [m]

@@ -169,7 +169,7 @@ def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
     findings = [_finding(matrix, fault) for fault in _gaps(matrix)]
     # Drop rows stage by stage.
     for stage in (_single_rows, _renewal, _neighbours):
-        faults = [fault for fault in stage(matrix) if fault.mask.any()]
+        faults = _together([fault for fault in stage(matrix) if fault.mask.any()])
         findings += [_finding(matrix, fault) for fault in faults]
         dropped = [fault.mask for fault in faults if fault.drops]
         if dropped:
@@ -185,6 +185,17 @@ def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
             problem = "sign flipped, repaired; expected neighbours of one sign"
             findings.append(_finding(matrix, RowFault("tip_qw..qz", problem, flipped, drops=False)))
     return matrix, findings
+
+
+def _together(faults: list[RowFault]) -> list[RowFault]:
+    """Return faults with one for all columns that have the same problem in the same rows."""
+    alike: dict[tuple[str, bytes, bool], list[RowFault]] = {}
+    for fault in faults:
+        alike.setdefault((fault.problem, fault.mask.tobytes(), fault.drops), []).append(fault)
+    return [
+        first._replace(column=f"{first.column} and {len(others)} more columns") if others else first
+        for first, *others in alike.values()
+    ]
 
 
 def _gaps(matrix: LogMatrix) -> Iterator[RowFault]:

@@ -37,16 +37,13 @@ class Section:
 
 
 def warning_lines(sections: Sequence[Section]) -> list[str]:
-    """Return the warnings for the terminal: a line for each remedy, with its first reason and their count."""
+    """Return the warnings for the terminal: a line for each remedy, with all its reasons."""
     reasons: dict[str, list[str]] = {}
     for section in sections:
         for warning in section.warnings:
             reason, _, remedy = warning.partition("\n")[0].rpartition(": ")
             reasons.setdefault(remedy, []).append(f"{section.title}: {reason}")
-    return [
-        f"warning: {first}" + f", and {len(others)} more" * bool(others) + f": {remedy}"
-        for remedy, (first, *others) in reasons.items()
-    ]
+    return [f"warning: {'; '.join(several)}: {remedy}" for remedy, several in reasons.items()]
 
 
 def to_json(

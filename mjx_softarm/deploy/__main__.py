@@ -98,6 +98,11 @@ class DriverOptions:
         Raises:
             InputError: one of them is not available.
         """
+        simulated = self.arm.startswith("twin:")
+        if simulated and ArmSpec.of(twin_spec(self.arm)).geometry != spec.geometry:
+            tell(
+                f"{self.arm} is a twin of another arm than {spec.name!r}, whose twins are twin:SEED@ARM.toml"
+            )
         return with_capture(open_arm(self.arm), self.capture, spec, tell)
 
 
@@ -274,8 +279,6 @@ def _record(
     low, high = arm_spec.chambers.pressure_min_kpa, arm_spec.chambers.pressure_max_kpa
     default = "" if spec or twin else ", by default; --spec names another arm"
     tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
-    if spec and options.arm.startswith("twin:") and ArmSpec.of(twin).geometry != arm_spec.geometry:
-        tell(f"{options.arm} is a twin of another arm than {spec}, whose twins are twin:SEED@{spec}")
 
     # The recording and its results
     tell(ACCURACY)

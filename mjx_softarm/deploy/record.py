@@ -43,7 +43,10 @@ MOST_POSES = 200
 CHECK_POSES = 10  # poses between two checks whether more bring something; two in a row have to agree
 ENOUGH = 0.95  # ratio of the errors by all poses and by half of them from which more poses bring nothing
 # What recordings of the paper's arm brought; docs/results/arms-minutes.json
-ACCURACY = "the paper's arm, simulated: its circle at 0.4 to 1.2 mm after 60 poses, at 0.4 to 0.7 after 150"
+ACCURACY = (
+    "for comparison, the paper's arm, simulated: "
+    "its circle at 0.4 to 1.2 mm after 60 poses, at 0.4 to 0.7 after 150"
+)
 LENGTHS = np.geomspace(
     1.0, 30.0, 6
 )  # length scales of the process that are tried, in deviations of the springs

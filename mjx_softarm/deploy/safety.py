@@ -7,7 +7,7 @@
                      chamber is driven or a spring of its section moves
     CHAMBER_LOST     a chamber at its limit, its spring off the reference, and the     vent
                      arm in the shape of one without that pressure: for a second, or
-                     for three while it moves
+                     for three while it moves; all at their limits, without air
     GOAL_OUTSIDE     a goal that no pressures bring the tip to, by the policy's        skip the goal
                      models and its threshold; a goal at run time further from all
                      reachable poses than they are from each other

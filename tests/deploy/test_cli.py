@@ -150,7 +150,7 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
 @pytest.mark.parametrize(
     ("words", "status", "lines"),
     [
-        ("record --arm twin:7 --spec wide.toml --out a.csv --poses 1", 0, "another arm than wide.toml"),
+        ("record --arm twin:7 --spec wide.toml --out a.csv --poses 1", 0, "another arm than 'wide'"),
         (f"run --arm its:Arm {FAR_AWAY}", 1, "policy: the package's own|goal outside the workspace"),
         (f"run policy.npz --arm its:Arm {MISSED}", 1, " NOT REACHED, |the policy is not calibrated"),
     ],

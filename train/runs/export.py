@@ -274,7 +274,7 @@ def contents(policy: Policy) -> list[str]:
     if worst_mm > POSE_ERROR_MM:
         lines.append(
             f"warning: 95 % of the estimated poses are within {worst_mm:.2g} mm of the simulation, expected "
-            f"{POSE_ERROR_MM:g} mm; the arm may be about to buckle at the limits of its pressures"
+            f"{POSE_ERROR_MM:g} mm; the arm may be about to buckle at its pressures' limits: narrow them"
         )
     return [
         *lines,

@@ -65,7 +65,7 @@ BY_SPRINGS = 0.05
 # an arm that lags by 0.25 s in stretching
 OF_ARM_LAG = 0.1
 # Error from which the actuators are of another kind: in the noise of the pressures, and at least
-MISFIT, SMALL_MISFIT_KPA = 4.0, 0.15
+MISFIT, SMALL_MISFIT_KPA = 4.0, 0.3
 # Greatest distance of a converged fit from its minimum, in standard deviations, RMS over the parameters; dead
 # times are interpolated between ticks, and the errors have kinks there
 SMALL_STEP = 0.2

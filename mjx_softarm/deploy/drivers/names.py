@@ -69,7 +69,7 @@ def open_arm(name: str) -> Any:
     try:
         kind = getattr(importlib.import_module(module_name), item)
     except ImportError as error:
-        raise InputError(f"--arm {name}: got {error}, expected a module that can be imported") from error
+        raise InputError(f"--arm {name}: got {error}, expected twin:SEED or a module of yours") from error
     except AttributeError as error:
         got = f"no {item!r} in {module_name}"
         raise InputError(f"--arm {name}: got {got}, expected an arm's class") from error
@@ -94,7 +94,8 @@ def _wired(path: Path) -> SerialArm:
     try:
         tables = tomllib.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{where}: got {error}, expected a TOML file") from error
+        got = error.strerror if isinstance(error, OSError) else f"{error}: no TOML"
+        raise InputError(f"{where}: got {got}, expected a TOML file") from error
     table = tables.get("arm")
     if {*tables} != {"arm"} or not isinstance(table, dict) or table.get("driver") != "serial":
         raise InputError(f'{where}: got {tables}, expected the table arm with driver = "serial"')
