@@ -99,6 +99,8 @@ def pipe_rows():
         ("300 mm, hand-made", "hand-made", "as shown"),
         ("250 mm, hand-made", "narrow-hand-made", "as shown"),
         ("250 mm, learned in 300 mm", "narrow-learned", "as shown"),
+        ("200 mm, learned", "narrowest", "as shown"),
+        ("200 mm, hand-made", "narrowest-hand-made", "as shown"),
     ):
         error = "/".join(mean("confined", kind, variant, f"{axis}_mm") for axis in "xyz")
         done = [one["done"] == one["operations"] for one in runs("confined", kind, variant)]
