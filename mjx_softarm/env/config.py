@@ -26,12 +26,10 @@ class Randomisation:
     payload_max_kg: Amount | None = None
     """the payload is uniform from the spec's to this much more; None: the arm's largest for a policy that
     observes the payload, else 0"""
-    stiffness_spread: PartialShare = (
-        0.0  # each chamber's stiffness is multiplied by 1 + uniform(-spread, spread)
-    )
-    damping_spread: PartialShare = (
-        0.0  # in motion, all dampers are multiplied by 1 + uniform(-spread, spread)
-    )
+    stiffness_spread: PartialShare = 0.0
+    """each chamber's stiffness is multiplied by 1 + uniform(-spread, spread)"""
+    damping_spread: PartialShare = 0.0
+    """in motion, all dampers are multiplied by 1 + uniform(-spread, spread)"""
     delay_max_s: Amount = 0.0  # in motion, dead times are uniform from the actuators' to this much more
     regulator_spread: PartialShare = 0.0
     """in motion, lag, dead time and rates of regulators are multiplied by 1 + uniform(-spread, spread)"""

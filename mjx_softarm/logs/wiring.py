@@ -52,7 +52,7 @@ def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
     ]
 
     # Changes by each chamber beside those to expect of all chambers
-    size = np.linalg.norm(change, axis=1)
+    size = np.maximum(np.linalg.norm(change, axis=1), 1e-12)
     still = size < LEAST_CHANGE * np.median(size)
     faults += [
         f"got chamber{k} that moves no spring, expected it to: no air, or a valve that does not open"

@@ -186,7 +186,7 @@ def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatc
 
     SMALL.replace(springs={"length_max_m": 0.35}).to_toml(tmp_path / "far.toml")
     _, printed, _ = run("workspace", "--spec", tmp_path / "far.toml", "--out", tmp_path)
-    assert "length_max_m: 85 to 350 mm, expected about what they reach" in printed
+    assert "now 0.085 and 0.350: change them" in printed
 
     # The paper's numbers stand beside its own arm alone, here at fewer pressures.
     few = random_pressures(SPEC, 32, seed=0)

@@ -132,7 +132,7 @@ def test_a_corrected_goal_removes_an_error_up_to_the_limit(limit, reward, left):
     env = SimpleNamespace(
         step=step,
         observe=lambda pose, goal, sensed: goal,
-        config=SimpleNamespace(moves=False, reward=reward),
+        config=SimpleNamespace(in_motion=False, reward=reward),
     )
     info, metrics = {"valid": jnp.array(True), "clearance_mm": jnp.inf}, {"saturated_chambers": jnp.zeros(())}
     begin = State(Tip(), jnp.zeros(6), jnp.zeros(()), jnp.zeros(()), metrics, info)
