@@ -20,7 +20,7 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.logs.checks import Finding
+from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.logs.wiring import wiring_faults
 from mjx_softarm.spec import ArmSpec
@@ -136,7 +136,8 @@ def _run(
     else:
         after = "train export RUN" if since else "train reach --preset analytic"
         print(f"next: python -m {after} --calibration {out}")
-    return 1 if any(section.warnings for section in calibration.sections) else 0
+    miswired = any(wiring_faults(log, arm) for log in read)
+    return 1 if miswired or any(section.warnings for section in calibration.sections) else 0
 
 
 def _check_seed(seed: int) -> None:
@@ -158,6 +159,8 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
         findings += of_log
         for finding in of_log:
             print(finding)
+        if strict and of_log:
+            raise LogError(of_log)
     return logs, findings
 
 

@@ -33,7 +33,7 @@ class TrainConfig:
     """environment"""
 
     def __post_init__(self) -> None:
-        check_ranges("train", self)
+        check_ranges("", self)
         given_kg = self.env.randomisation.payload_max_kg
         if self.env.observation == "payload" and given_kg is not None:
             raise InputError(
@@ -111,7 +111,7 @@ def _read(kind: Any, value: Any, path: str) -> Any:
         hints = typing.get_type_hints(kind)
         fields = [item.name for item in dataclasses.fields(kind)]
         if not isinstance(value, dict) or not value.keys() <= set(fields):
-            got = sorted(value) if isinstance(value, dict) else value
+            got = sorted(value.keys() - set(fields)) if isinstance(value, dict) else value
             raise InputError(f"{path}: got {got}, expected the settings {sorted(fields)}")
         prefix = f"{path}." if path else ""
         values = {name: _read(hints[name], item, prefix + name) for name, item in value.items()}

@@ -78,7 +78,7 @@ def check_ranges(where: str, settings: Any) -> None:
     """Refuse a setting of a dataclass outside the range, or the names, of its type.
 
     Args:
-        where: path or class of the settings, for the message.
+        where: path or class of the settings with a dot at its end, or empty, for the message.
         settings: dataclass whose fields have types such as `Count` or `Literal`; None has no range.
 
     Raises:
@@ -86,10 +86,12 @@ def check_ranges(where: str, settings: Any) -> None:
     """
     hints = typing.get_type_hints(type(settings), include_extras=True)
     for item in fields(settings):
-        value = getattr(settings, item.name)
-        for accepts, expected in [] if value is None else _expectations(hints[item.name]):
+        value, hint = getattr(settings, item.name), hints[item.name]
+        if value is None and type(None) in get_args(hint):
+            continue
+        for accepts, expected in _expectations(hint):
             if not accepts(value):
-                raise InputError(f"{where}.{item.name}: got {value!r}, expected {expected}")
+                raise InputError(f"{where}{item.name}: got {value!r}, expected {expected}")
 
 
 def _expectations(hint: Any) -> Iterator[tuple[Callable[[Any], bool], str]]:

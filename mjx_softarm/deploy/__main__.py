@@ -98,12 +98,13 @@ class DriverOptions:
         Raises:
             InputError: one of them is not available.
         """
+        driver = open_arm(self.arm)
         simulated = self.arm.startswith("twin:")
         if simulated and ArmSpec.of(twin_spec(self.arm)).geometry != spec.geometry:
             tell(
                 f"{self.arm} is a twin of another arm than {spec.name!r}, whose twins are twin:SEED@ARM.toml"
             )
-        return with_capture(open_arm(self.arm), self.capture, spec, tell)
+        return with_capture(driver, self.capture, spec, tell)
 
 
 Arms = Annotated[DriverOptions, tyro.conf.arg(name="")]

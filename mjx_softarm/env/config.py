@@ -36,7 +36,7 @@ class Randomisation:
     friction_max_n: Amount = 0.0  # in motion, each chamber's dry friction is uniform from 0 to this
 
     def __post_init__(self):
-        check_ranges("Randomisation", self)
+        check_ranges("Randomisation.", self)
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,8 @@ class EnvConfig:
 
     def __post_init__(self):
         # Ranges and names
-        check_ranges("EnvConfig", self)
-        check_ranges("RewardConfig", self.reward)
+        check_ranges("EnvConfig.", self)
+        check_ranges("RewardConfig.", self.reward)
         axes = self.reward.axes
         usable = len(axes) == 6 and all(0 <= axis < math.inf for axis in axes) and any(self.reward.asked)
         required = {"axes": (usable, "six finite numbers >= 0, some more than 0")}

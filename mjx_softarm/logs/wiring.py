@@ -16,25 +16,27 @@ from mjx_softarm.spec import ArmSpec
 # All by hand. On four kinds of arms, twins and rods with lags of up to 0.8 s among them, changes by chambers
 # are like those expected by 0.71 to 0.98, and like those of another chamber by 0.3 at most.
 ROWS_PER_CHAMBER = 20  # fewer rows show nothing
-LEAST_KPA = 0.5  # standard deviation of a pressure that counts as changing
+LEAST_SHARE_KPA = 0.05  # standard deviation of a pressure that counts as changing, in its range
 LEAST_SPREAD = 0.05  # least eigenvalue of the pressures' correlations: in a way of a policy they go together
 LEAST_SHARE = 0.3  # share of a spring's variance below which it follows no pressure
-LEAST_CHANGE = 0.1  # change of the springs by a chamber, over the median of all, below which it moves none
+LEAST_CHANGE = 0.1  # change of the springs by a chamber, over the largest, below which it moves none
+LEAST_M = 1e-5  # standard deviation of a spring that changes
 MARGIN = 0.3  # by which the changes have to be more like those of another chamber
 STRETCH = 0.3  # stretch of a section over its bend, at the springs
 
 
 def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
     """Return what a log says against the wiring: "got X, expected Y", empty if it says nothing."""
-    # Rows with pressures that change from chamber to chamber
-    readings = log.readings_of(spec.sensor)
-    if log.pressure_kpa is None or readings is None:
+    # Rows with commands that change from chamber to chamber
+    kpa = log.pressure_kpa if log.commanded_kpa is None else log.commanded_kpa
+    if kpa is None or (readings := log.readings_of(spec.sensor)) is None:
         return []
     spring_m = spec.spring_sensor.lengths(readings, np.nan).length_m
-    known = np.isfinite(spring_m).all(axis=1) & np.isfinite(log.pressure_kpa).all(axis=1)
-    kpa, spring_m = log.pressure_kpa[known], spring_m[known]
+    known = np.isfinite(spring_m).all(axis=1) & np.isfinite(kpa).all(axis=1)
+    kpa, spring_m = kpa[known], spring_m[known]
     n, c = kpa.shape
-    if n < ROWS_PER_CHAMBER * c or kpa.std(axis=0).min() < LEAST_KPA:
+    least_kpa = LEAST_SHARE_KPA * (spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa)
+    if n < ROWS_PER_CHAMBER * c or kpa.std(axis=0).min() < least_kpa:
         return []
     if np.linalg.eigvalsh(np.corrcoef(kpa.T)).min() < LEAST_SPREAD:
         return []
@@ -42,8 +44,8 @@ def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
     # Changes of the springs with the pressures, and the springs that follow none
     off_kpa, off_m = kpa - kpa.mean(axis=0), spring_m - spring_m.mean(axis=0)
     change = np.linalg.lstsq(off_kpa, off_m, rcond=None)[0]  # (c, n_springs) [m/kPa]
-    followed = 1.0 - np.var(off_m - off_kpa @ change, axis=0) / np.maximum(np.var(off_m, axis=0), 1e-12)
-    dead = followed < LEAST_SHARE
+    left = np.var(off_m - off_kpa @ change, axis=0) / np.maximum(np.var(off_m, axis=0), LEAST_M**2)
+    dead = (left > 1.0 - LEAST_SHARE) | (np.std(off_m, axis=0) < LEAST_M)
     if dead.all():
         return ["got springs that do not follow the pressures, expected each to: no air, or no valve opens"]
     faults = [
@@ -53,7 +55,7 @@ def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
 
     # Changes by each chamber beside those to expect of all chambers
     size = np.maximum(np.linalg.norm(change, axis=1), 1e-12)
-    still = size < LEAST_CHANGE * np.median(size)
+    still = size < LEAST_CHANGE * size.max()
     faults += [
         f"got chamber{k} that moves no spring, expected it to: no air, or a valve that does not open"
         for k in np.flatnonzero(still)

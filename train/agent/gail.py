@@ -42,7 +42,7 @@ class GailConfig:
     input_scale: Positive = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:
-        check_ranges("learner.gail", self)
+        check_ranges("learner.gail.", self)
 
 
 class DiscriminatorState(NamedTuple):

@@ -41,7 +41,7 @@ class HindsightConfig:
     saturation_costs: bool = True  # also where the goal is the pose reached; in the paper that has its bonus
 
     def __post_init__(self) -> None:
-        check_ranges("learner.hindsight", self)
+        check_ranges("learner.hindsight.", self)
         fits = self.reached_share + self.near_share <= 1
         check_settings("learner.hindsight", self, {"reached_share": (fits, "at most 1 - near_share")})
 

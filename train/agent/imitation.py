@@ -63,7 +63,7 @@ class GoalStage:
     kept: Share = 1.0  # share of the replay's transitions that is kept as the stage begins
 
     def __post_init__(self) -> None:
-        check_ranges("learner.stages", self)
+        check_ranges("learner.stages.", self)
 
 
 def _stages(words: list[str]) -> tuple[GoalStage, ...]:

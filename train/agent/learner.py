@@ -28,7 +28,7 @@ class LearnerConfig:
     vector_steps_per_epoch: Count = 16  # actions of each arm between two reports
 
     def __post_init__(self) -> None:
-        check_ranges("learner", self)
+        check_ranges("learner.", self)
 
     def check(self, env: EnvConfig) -> None:
         """Raise InputError where the learner cannot learn in an environment."""
