@@ -37,6 +37,8 @@ Strict = Annotated[
     bool, tyro.conf.arg(help="refuse logs with any fault", help_behavior_hint="(default: drop rows)")
 ]
 
+WIRING = "wiring"  # stands for the column of a finding about it
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
@@ -136,7 +138,7 @@ def _run(
     else:
         after = "train export RUN" if since else "train reach --preset analytic"
         print(f"next: python -m {after} --calibration {out}")
-    miswired = any(wiring_faults(log, arm) for log in read)
+    miswired = any(finding.column == WIRING for finding in findings)
     return 1 if miswired or any(section.warnings for section in calibration.sections) else 0
 
 
@@ -154,13 +156,13 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
     logs, findings = [], []
     for path in paths:
         log, of_log = read_log(path, spec, strict)
-        of_log = [*of_log, *(Finding(str(path), None, "", fault) for fault in wiring_faults(log, spec))]
+        of_log = [*of_log, *(Finding(str(path), None, WIRING, fault) for fault in wiring_faults(log, spec))]
+        if strict and of_log:
+            raise LogError(of_log)
         logs.append(log)
         findings += of_log
         for finding in of_log:
             print(finding)
-        if strict and of_log:
-            raise LogError(of_log)
     return logs, findings
 
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.body import chamber_directions, spring_directions
 from mjx_softarm.spec import ArmSpec
 
 # All by hand. On four kinds of arms, twins and rods with lags of up to 0.8 s among them, changes by chambers
 # are like those expected by 0.71 to 0.98, and like those of another chamber by 0.3 at most.
 ROWS_PER_CHAMBER = 20  # fewer rows show nothing
-LEAST_SHARE_KPA = 0.05  # standard deviation of a pressure that counts as changing, in its range
+LEAST_PRESSURE = 0.05  # standard deviation of a pressure that counts as changing, in its range
 LEAST_SPREAD = 0.05  # least eigenvalue of the pressures' correlations: in a way of a policy they go together
 LEAST_SHARE = 0.3  # share of a spring's variance below which it follows no pressure
 LEAST_CHANGE = 0.1  # change of the springs by a chamber, over the largest, below which it moves none
@@ -35,7 +36,7 @@ def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
     known = np.isfinite(spring_m).all(axis=1) & np.isfinite(kpa).all(axis=1)
     kpa, spring_m = kpa[known], spring_m[known]
     n, c = kpa.shape
-    least_kpa = LEAST_SHARE_KPA * (spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa)
+    least_kpa = LEAST_PRESSURE * (spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa)
     if n < ROWS_PER_CHAMBER * c or kpa.std(axis=0).min() < least_kpa:
         return []
     if np.linalg.eigvalsh(np.corrcoef(kpa.T)).min() < LEAST_SPREAD:
@@ -73,8 +74,6 @@ def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
 
 def _expected(spec: ArmSpec) -> np.ndarray:
     """Return the changes (n_chambers, n_springs) of springs by chambers, without a unit."""
-    per_section = spec.structure.chambers_per_section
-    chamber_rad = 2.0 * np.pi * np.arange(per_section) / per_section
-    spring_rad = 2.0 * np.pi * np.arange(spec.springs_per_section) / spec.springs_per_section
-    section = STRETCH + np.cos(chamber_rad[:, None] - spring_rad)
-    return np.kron(np.eye(spec.structure.n_sections), section)
+    alike = STRETCH + chamber_directions(spec) @ spring_directions(spec).swapaxes(1, 2)  # of each section
+    apart = np.eye(spec.structure.n_sections)
+    return np.einsum("sck,st->sctk", alike, apart).reshape(spec.n_chambers, spec.n_springs)
