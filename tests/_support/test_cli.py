@@ -121,14 +121,15 @@ def test_a_mistake_is_printed_with_what_it_may_be_and_status_2(words, printed, c
 
 
 @pytest.mark.parametrize(
-    ("code", "status", "told"), [(None, 0, ""), (3, 3, ""), ("no serial port", 2, "error: no serial port\n")]
+    ("code", "status", "printed"),
+    [(None, 0, ""), (3, 3, ""), ("no serial port", 2, "error: no serial port\n")],
 )
-def test_a_program_that_ends_itself_keeps_its_status_or_its_message(code, status, told, capsys):
+def test_a_program_that_ends_itself_keeps_its_status_or_its_message(code, status, printed, capsys):
     def ends() -> int:
         raise SystemExit(code)
 
     assert cli.guarded(ends) == status
-    assert capsys.readouterr().err == told
+    assert capsys.readouterr().err == printed
 
 
 PRINTS = """
@@ -181,9 +182,9 @@ def test_help_tells_every_option_and_imports_no_command(capsys, tmp_path, monkey
     assert run("show") == 0
     assert "  show files  Show files." in (listed := capsys.readouterr().out) and "make" not in listed
     assert run("make", "--help") == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     # A setting that begins as true is shown by its own name, not by its opposite alone.
-    assert all(text in told for text in ("--inner.gamma FLOAT", "discount", "--noisy, --no-noisy"))
+    assert all(text in printed for text in ("--inner.gamma FLOAT", "discount", "--noisy, --no-noisy"))
     assert run("make", "--no-noisy") == 0 and not RESULTS[0].settings.noisy
 
 

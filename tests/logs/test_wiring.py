@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from calib.__main__ import main
 from mjx_softarm import ArmSpec
-from mjx_softarm.logs.schema import Log
+from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.logs.wiring import wiring_faults
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.twin.rod_twin import RodTwin
@@ -49,6 +50,15 @@ def test_exchanged_sensors_and_valves_are_named(log, first, second):
         assert len(faults) == 2
         assert f"chamber{first} that moves the springs beside chamber{second}" in faults[0]
         assert f"chamber{second} that moves the springs beside chamber{first}" in faults[1]
+
+
+def test_a_log_of_exchanged_sensors_is_named_and_refused_if_strict(log, tmp_path, capsys):
+    path = tmp_path / "exchanged.npz"
+    write_log(path, dataclasses.replace(log, readings=log.readings[:, [4, 1, 2, 3, 0, 5, 6, 7, 8]]))
+    assert main(["check", str(path)]) == 1
+    assert f"{path}: wiring: got chamber0 that moves" in capsys.readouterr().out
+    assert main(["check", str(path), "--strict"]) == 2
+    assert f"{path}: wiring: got chamber0 that moves" in capsys.readouterr().err
 
 
 def test_no_air_a_closed_valve_and_a_loose_sensor_are_named(log):

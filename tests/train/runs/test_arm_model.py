@@ -24,30 +24,30 @@ def distilled_at_once(monkeypatch):
 
 
 def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, monkeypatch):
-    told, file = [], tmp_path / arm_model.ESTIMATORS_FILE
+    printed, file = [], tmp_path / arm_model.ESTIMATORS_FILE
 
     def model(spec=POLICY.spec):
         """Return the model as another process makes it."""
         monkeypatch.setattr(arm_model, "_distilled", {})
-        return arm_model.arm_model(CalibratedArm(spec), tmp_path, told.append)
+        return arm_model.arm_model(CalibratedArm(spec), tmp_path, printed.append)
 
     first, again = model(), model()
     jax.tree.map(np.testing.assert_array_equal, first.model, again.model)
-    assert first.errors == again.errors and len(told) == 1
+    assert first.errors == again.errors and len(printed) == 1
 
     other = POLICY.spec.replace(mass={"payload_kg": 0.1})
     model(other), model(other)
-    assert len(told) == 2
+    assert len(printed) == 2
     file.write_bytes(file.read_bytes()[:-100])
     model(other)
-    assert len(told) == 3
+    assert len(printed) == 3
     monkeypatch.setattr(arm_model.estimator, "N_TRAINING", 1)
     model(other)
-    assert len(told) == 4
+    assert len(printed) == 4
 
 
 def test_a_folder_to_read_only_changes_nothing(tmp_path):
-    told = []
+    printed = []
     for _ in range(2):  # the second time, the process has the networks
-        arm_model.arm_model(CalibratedArm(POLICY.spec), tmp_path / "absent", told.append)
-    assert len(told) == 1
+        arm_model.arm_model(CalibratedArm(POLICY.spec), tmp_path / "absent", printed.append)
+    assert len(printed) == 1
