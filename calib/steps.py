@@ -7,6 +7,7 @@ and warns.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
@@ -93,10 +94,10 @@ def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> Step
     """Fit pumps or regulators to commanded and measured pressures, or to commands and springs."""
     spec = arm.spec
     tracks, lag = find_tracks(measurements.logs, spec), MEASURED
-    if not tracks and (resting_kpa := pressures_by_springs(measurements, spec, seed)):
+    if not tracks and measurements.poses.n >= MIN_POSES:
         # No pressure was measured: the springs are the gauge, and the shape shows the arm's own lag
-        tracks = find_tracks(measurements.logs, spec, resting_kpa)
-        shape = fit_shape(measurements.logs, spec) if tracks else None
+        tracks = find_tracks(measurements.logs, spec, functools.partial(pressures_by_springs, arm))
+        shape = fit_shape(measurements.logs, arm) if tracks else None
         known = spec.shape_lag_s, PRIOR
         if shape is not None and shape.is_better:
             known = shape.lag_s, shape.log_std
@@ -112,24 +113,10 @@ def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> Step
     return StepResult(arm._replace(spec=fit.spec), sections.actuators(fit))
 
 
-def pressures_by_springs(
-    measurements: Measurements, spec: ArmSpec, seed: int
-) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return the pressures (n, c) [kPa] of the arm at rest by its spring lengths (n, n_springs) [m].
-
-    They are the simulated ones, and a process of what these miss at the poses at rest; None with too few of
-    them.
-    """
-    poses, rows, settled, _, _ = _settled_poses(measurements, spec)
-    if len(rows) < MIN_POSES:
-        return None
-    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[rows], settled.pressure_kpa, seed)
-
-    def resting_kpa(spring_m: np.ndarray) -> np.ndarray:
-        kpa = np.asarray(simulate_poses(spec, spring_m).pressure_kpa, float)
-        return kpa + residual(held.held, spring_m, kpa).mean_kpa.reshape(kpa.shape) if held.is_better else kpa
-
-    return resting_kpa
+def pressures_by_springs(arm: CalibratedArm, spring_m: np.ndarray) -> np.ndarray:
+    """Return the pressures (n, c) [kPa] that hold an arm at rest at its spring lengths (n, n_springs) [m]."""
+    kpa = np.asarray(simulate_poses(arm.spec, spring_m).pressure_kpa, float)
+    return kpa if arm.held is None else kpa + residual(arm.held, spring_m, kpa).mean_kpa.reshape(kpa.shape)
 
 
 def damping(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
@@ -140,10 +127,10 @@ def damping(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepRe
         needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
         return StepResult(arm, Section("Damping", f"{NOT_FITTED} {needed}"))
     # The lag of the shape shows the backbone's damping by itself
-    shape, prior = fit_shape(measurements.logs, spec), PRIOR
-    if shape is not None and shape.is_better:
-        spec, prior = shape.spec, min(shape.log_std, PRIOR)
-    fit = fit_damping(stretches, spec, seed, prior)
+    shape, bending = fit_shape(measurements.logs, arm), None
+    if shape is not None and np.isfinite(shape.log_std):
+        spec, bending = shape.spec if shape.is_better else spec, shape.half_width_s / shape.lag_s
+    fit = fit_damping(stretches, spec, seed, bending)
     return StepResult(arm._replace(spec=fit.spec if fit.is_better else spec), sections.damping(fit, shape))
 
 
@@ -254,9 +241,9 @@ STEPS: Mapping[str, Step] = MappingProxyType(
     {
         "springs": springs,
         "chambers": chambers,
+        "sim-to-real network": s2r,
         "actuators": actuators,
         "damping": damping,
-        "sim-to-real network": s2r,
     }
 )
 

@@ -5,7 +5,8 @@ actuators make of the commands where no pressures were measured. Its tip is comp
 The first seconds do not count: the arm's motion at the beginning is unknown, and decays.
 
 The damping of the springs and the axial damping of the backbone stay as specified. They act in parallel with
-the chambers, which absorb their error.
+the chambers, which absorb their error. The bending damping of the backbone is fitted here only where
+`calib.fit.motion.shape` does not show it: the model's errors at rest are ten times as large as what it changes.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class DampingFit:
 
 
 def fit_damping(
-    stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0, bending_prior: float = PRIOR
+    stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0, bending_half_width: float | None = None
 ) -> DampingFit:
     """Fit the damping of chambers and backbone to the motion of an arm.
 
@@ -84,7 +85,8 @@ def fit_damping(
         stretches: parts of logs from `find_stretches`, one or more.
         spec: arm, its chambers already calibrated.
         seed: seed that chooses the held-out seconds.
-        bending_prior: standard deviation of the logarithm of the backbone's damping.
+        bending_half_width: relative half-width of the 95 % interval of the backbone's damping, which stays; None
+            to fit it.
 
     Raises:
         InputError: the specified damping is zero.
@@ -97,10 +99,11 @@ def fit_damping(
             "expected both above 0"
         )
     # Fit to the seconds that are not held out.
+    n_free = 2 if bending_half_width is None else 1
     n_clusters = len(_clusters(stretches, [s.tip_m for s in stretches], spec))
     held_out = held_out_blocks(n_clusters, block=2, seed=seed)
     problem = Problem(
-        prior=np.array([PRIOR, bending_prior]),
+        prior=np.full(n_free, PRIOR),
         group=np.zeros(3 * _rows(CLUSTER_S, spec), int),
         scale=np.array([SCALE_M]),
         min_scale=np.array([MIN_SCALE_M]),
@@ -112,9 +115,9 @@ def fit_damping(
 
     solution = fit(model, problem)
     # Judge the fit by the held-out seconds.
-    before, after = (_errors(stretches, spec, x)[0] for x in (np.zeros(2), solution.x))
+    before, after = (_errors(stretches, spec, x)[0] for x in (np.zeros(n_free), solution.x))
     calibrated = damped(spec, solution.x)
-    widths = solution.half_width
+    widths = np.append(solution.half_width, [] if bending_half_width is None else bending_half_width)
     done = DampingFit(
         spec=calibrated,
         half_width_95={
@@ -169,8 +172,8 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
 
 
 def damped(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
-    """Return the arm with the damping of chambers and backbone times exp(x), (2,)."""
-    chambers, bending = map(float, np.exp(x))
+    """Return the arm with the damping of chambers and backbone times exp(x), (2,); (1,) of chambers alone."""
+    chambers, bending = map(float, np.exp([*x, 0.0][:2]))
     backbone = spec.backbone.bending_damping_nms_per_rad
     return spec.replace(
         chambers={"damping_ns_per_m": scaled(spec.chambers.damping_ns_per_m, chambers)},
@@ -194,13 +197,13 @@ def simulate(stretch: Stretch, spec: ArmSpec) -> np.ndarray:
 
 
 def _errors(stretches: Sequence[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return simulated minus measured tip by clusters (n, m) [m], NaN-padded; Jacobian (n, m, 2)."""
+    """Return simulated minus measured tip by clusters (n, m) [m], NaN-padded; Jacobian (n, m, len(x))."""
     # Differences of three runs: derivatives through thousands of MJX's steps would compile for minutes.
-    arms = [damped(spec, x + d) for d in (np.zeros(2), *(DIFFERENCE * np.eye(2)))]
+    arms = [damped(spec, x + d) for d in (np.zeros(len(x)), *(DIFFERENCE * np.eye(len(x))))]
     with ThreadPoolExecutor() as pool:  # MuJoCo steps without Python's lock
         runs = list(pool.map(lambda job: simulate(*job), [(s, arm) for arm in arms for s in stretches]))
     n = len(stretches)
-    here, *ahead = (_clusters(stretches, runs[k * n : (k + 1) * n], spec) for k in range(3))
+    here, *ahead = (_clusters(stretches, runs[k * n : (k + 1) * n], spec) for k in range(len(arms)))
     return here, np.stack([(a - here) / DIFFERENCE for a in ahead], axis=-1)
 
 

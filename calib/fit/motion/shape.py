@@ -7,7 +7,8 @@ shares its bend. In motion the shares lag by a time constant T, which the dampin
     even(l) + U,    T U' = rest(l) - even(l) - U,
 
 with the tip's place rest(l) at rest with spring lengths l, and even(l) with sections that bend evenly.
-Neither pressures nor the chambers' damping take part. Errors of rest(l) are taken for linear in l. A row
+Neither pressures nor the chambers' damping take part. The sim-to-real network corrects rest(l); what is left
+of its errors is taken for linear in l. A row
 without a tip has no error, and U goes on there. Rows without lengths cut a log into parts.
 
 The interval of log T follows from the curvature of the cost, from the spread of its slope between blocks of
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.arm import CalibratedArm
 from calib.fit.motion.tracks import dense_parts, spring_lengths_m
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.fields import scaled
@@ -28,6 +30,7 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.estimator import Frame, even_pose
 from mjx_softarm.sensing.load import QUANTILE
+from mjx_softarm.sensing.s2r import correct
 from mjx_softarm.spec import ArmSpec
 
 MIN_S = 10.0  # length of a part of a log
@@ -71,16 +74,16 @@ class ShapeFit:
         return QUANTILE * self.log_std * self.lag_s
 
 
-def fit_shape(logs: Sequence[Log], spec: ArmSpec) -> ShapeFit | None:
+def fit_shape(logs: Sequence[Log], arm: CalibratedArm) -> ShapeFit | None:
     """Fit the bending damping to the lag of the shape; None where no log follows springs and tip in motion.
 
     Args:
         logs: of the arm; those without springs, tip or dense rows are left out.
-        spec: arm, its sensors and chambers already calibrated.
+        arm: its sensors, chambers and sim-to-real network already calibrated.
     """
-    parts, left = [], round(MAX_TOTAL_S / EVERY_S)
+    spec, parts, left = arm.spec, [], round(MAX_TOTAL_S / EVERY_S)
     for log in logs:
-        for part in _parts(log, spec, left):
+        for part in _parts(log, arm, left):
             parts.append(part)
             left -= len(part[0])
     if not parts or not spec.shape_lag_s:
@@ -118,9 +121,10 @@ def _log_std(cost: np.ndarray) -> float:
 Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def _parts(log: Log, spec: ArmSpec, left: int) -> list[Part]:
+def _parts(log: Log, arm: CalibratedArm, left: int) -> list[Part]:
     """Return the parts of a log without gaps of time or lengths, a row each `EVERY_S`: the last `left`."""
     # Spring lengths, and the mounting
+    spec = arm.spec
     spring_m, tip_m = spring_lengths_m(log, spec), log.tip_m
     if tip_m is None or spring_m is None:
         return []
@@ -138,11 +142,12 @@ def _parts(log: Log, spec: ArmSpec, left: int) -> list[Part]:
         if not known[part[0]] or np.count_nonzero(seen) * EVERY_S < MIN_S:
             continue
         length_m, at_rest = spring_m[rows], simulate_poses(spec, spring_m[rows])
+        rest_mm = at_rest.pose if arm.s2r is None else np.asarray(correct(arm.s2r, at_rest.pose, length_m))
         even_mm = even_pose(base, np.asarray(params.spring_site_m), length_m)[:, :3]
         # A row at which the simulated arm finds no rest has no error, and the rest of the row before it
         tip_mm = np.where((seen & at_rest.valid)[:, None], 1e3 * tip_m[rows], np.nan)
         newest_valid = np.maximum.accumulate(np.where(at_rest.valid, np.arange(len(rows)), 0))
-        parts.append((length_m, tip_mm - even_mm, (at_rest.pose[:, :3] - even_mm)[newest_valid]))
+        parts.append((length_m, tip_mm - even_mm, (rest_mm[:, :3] - even_mm)[newest_valid]))
         left -= len(rows)
     return parts
 
