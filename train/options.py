@@ -16,8 +16,7 @@ from mjx_softarm._support import cli, xla
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
-from train.agent.registry import LEARNERS, name_of
-from train.config import TrainConfig
+from train.config import LEARNERS, TrainConfig, name_of
 from train.presets import PRESETS, preset_of
 
 
@@ -72,7 +71,7 @@ class ReachOptions(NewRunOptions):
     """settings to begin with; the defaults below are this preset's"""
     size: Literal["cpu", "gpu"] = "cpu"
     """machine that the preset's numbers of arms, steps and transitions suit; gpu: of analytic and motion"""
-    learner: Annotated[str, cli.one_of(n for n, e in LEARNERS.items() if not e.from_demonstrations)] = "tqc"
+    learner: Annotated[str, cli.one_of(n for n, c in LEARNERS.items() if not c.FROM_DEMONSTRATIONS)] = "tqc"
     """learner; where it is not the preset's, it begins with its own defaults"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
@@ -84,7 +83,7 @@ class ReachOptions(NewRunOptions):
         preset_learner = name_of(config.learner)
         learner = named(arguments, "--learner", LEARNERS, preset_learner)
         if learner != preset_learner:
-            config = dataclasses.replace(config, learner=LEARNERS[learner].config())
+            config = dataclasses.replace(config, learner=LEARNERS[learner]())
         return cls(preset=preset, size=size, learner=learner, config=config)
 
 

@@ -28,14 +28,12 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
-from train.agent.registry import epoch_of
 from train.config import TrainConfig, override
 from train.epoch.job import Epoch, Job, State
 from train.options import ReachOptions, start
 from train.runs.evaluate import Summary
 from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
-from train.runs.run import Interrupted, free_path, train_together
-from train.runs.task import fresh_poses, task_of
+from train.runs.run import Interrupted, free_path, fresh_poses, task_of, train_together
 
 RESULTS_FILE = "results.json"
 
@@ -159,7 +157,7 @@ class MembersEpoch:
     """`Epoch` of all members, each with its own config, which holds traced numbers."""
 
     def __init__(self, config: TrainConfig, env: ReachEnv):
-        one = epoch_of(config.learner, env)
+        one = config.learner.make_epoch(env)
         self.config, self.env, self.kind, self.learner = config, env, one.kind, one.learner
 
     def first(self, key: tuple[Array, dict[str, Array]]) -> MembersState:
@@ -180,7 +178,7 @@ class MembersEpoch:
         config = self.config
         for path, number in numbers.items():
             config = _with_number(config, path, number)
-        return epoch_of(config.learner, with_config(self.env, config))
+        return config.learner.make_epoch(with_config(self.env, config))
 
 
 def _with_number(config: Any, path: str, number: Array) -> Any:

@@ -3,7 +3,6 @@
 from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import EnvConfig
 from tests.arms import SHORT as SHORT
-from train.agent.registry import epoch_of
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 from train.epoch.job import Job
@@ -22,7 +21,7 @@ CONFIG = TrainConfig(learner=LEARNER, env=EnvConfig(engine="chain", n_poses=256)
 
 
 def new_job(config, env):
-    return Job(epoch_of(config.learner, env))
+    return Job(config.learner.make_epoch(env))
 
 
 def distil_little(monkeypatch):

@@ -25,7 +25,7 @@ from train.presets import PRESETS
 from train.runs import plots
 from train.runs.evaluate import Summary
 from train.runs.folder import Checkpoints, Run
-from train.runs.task import Task
+from train.runs.run import Task
 from train.sweep import RESULTS_FILE, MembersEpoch, members_of, open_members, report, setting, variable
 
 CONFIG = dataclasses.replace(

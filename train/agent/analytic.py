@@ -41,6 +41,7 @@ from mjx_softarm.env.vector import VectorEnv, choose_arms
 from mjx_softarm.mdp import rewards
 from train.agent.learner import LearnerConfig
 from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
+from train.demos.demonstrations import Demonstrations
 
 Params = Any  # a flax parameter tree
 MAX_GRADIENT_NORM = 1.0  # a longer gradient is shortened to this
@@ -70,6 +71,10 @@ class AnalyticConfig(LearnerConfig):
         engine = "mjx" if env.in_motion else "chain"
         usable = env.engine == engine
         check_settings("env", env, {"engine": (usable, f"{engine!r}, whose gradient this learner takes")})
+
+    def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> GradientEpoch:
+        """Return the epoch of gradient steps."""
+        return GradientEpoch(self, env)
 
 
 class AnalyticState(NamedTuple):

@@ -19,7 +19,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from jax import Array
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import xla
-from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.errors import InputError, check_settings
 from mjx_softarm._support.fields import (
     Amount,
     Count,
@@ -48,7 +48,7 @@ from train.agent.networks import check_same_shapes
 from train.agent.tqc import TQC, TQCConfig, TQCState
 from train.demos.demonstrations import Demonstrations, shown_before
 from train.epoch import replay
-from train.epoch.replay_epoch import ReplayState
+from train.epoch.replay_epoch import ReplayEpoch, ReplayState
 
 ExpertStart = Literal["agent", "shown"]
 EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they are reached
@@ -88,6 +88,8 @@ STAGES_OPTION = PrimitiveConstructorSpec(
 @dataclass(frozen=True)
 class ImitationConfig(TQCConfig):
     """Settings of learning from demonstrations, whose poses are the goals. Raises InputError."""
+
+    FROM_DEMONSTRATIONS: ClassVar[bool] = True
 
     gail: GailConfig = field(default_factory=GailConfig)
     """discriminator"""
@@ -131,6 +133,16 @@ class ImitationConfig(TQCConfig):
             "observation": (env.observation == "pose", "'pose' for demonstrations"),
         }
         check_settings("env", env, required)
+
+    def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> ReplayEpoch:
+        """Return the epoch of the learner, with demonstrated starts and goals.
+
+        Raises:
+            InputError: demonstrations are missing.
+        """
+        if shown is None:
+            raise InputError("learner: got 'imitation' without demonstrations, expected a file of them")
+        return ReplayEpoch(self, env, Imitation(self, env, shown), DemonstratedGoals(self, env, shown))
 
     @property
     def stage_epochs(self) -> tuple[int, ...]:

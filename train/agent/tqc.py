@@ -34,7 +34,7 @@ from jax import Array
 from mjx_softarm._support import draws
 from mjx_softarm._support.errors import check_settings
 from mjx_softarm._support.fields import Amount, Count, Number, Positive, PositiveShare, Share
-from mjx_softarm.env import EnvConfig
+from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
 from train.agent import networks
 from train.agent.hindsight import HindsightConfig
@@ -82,6 +82,10 @@ class TQCConfig(ReplayConfig):
         super().check(env)
         seen = self.n_ahead == 0 or env.observation == "motion"
         check_settings("learner", self, {"n_ahead": (seen, "0 without env.observation 'motion'")})
+
+    def make_learner(self, env: ReachEnv) -> TQC:
+        """Return TQC for the observations and actions of an environment."""
+        return TQC(env.observation_size, env.action_size, self)
 
 
 def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:

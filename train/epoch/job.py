@@ -40,11 +40,8 @@ class Epoch(Protocol):
 class Job:
     """A compiled epoch: each of its two functions is traced once, and the state is donated.
 
-    `n_traces` counts how often the epoch was traced: once in a run.
-
-    Args:
-        epoch: the epoch.
-        pool_of: returns the poses of an epoch, by default always those of the environment.
+    `n_traces` counts how often the epoch was traced: once in a run. `pool_of` returns the poses of an epoch,
+    by default always those of the environment.
     """
 
     def __init__(self, epoch: Epoch, pool_of: Callable[[int], Pool] | None = None):
@@ -85,22 +82,12 @@ class Job:
     def start(self, first: Callable[[], T]) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled meanwhile.
 
-        Another thread calls `first`; the pool of poses settles there. A second call compiles nothing.
+        Another thread calls `first`; the pool of poses settles there.
         """
-        if self.n_traces:
-            return first()
         with ThreadPoolExecutor(1) as beside:
             result = beside.submit(first)
             self.compile_epoch()
             return result.result()
-
-    def policy(self, state: State) -> Any:
-        """Return the parameters of the policy that is evaluated and exported."""
-        return self.learner.policy(state.learner)
-
-    def parts(self, state: State) -> dict[str, Any]:
-        """Return what a checkpoint keeps for export and for other runs, by name."""
-        return self.learner.parts(state.learner)
 
 
 class FreshPoses:

@@ -26,7 +26,6 @@ from train.presets import IMITATION_PRESETS
 from train.runs import run as runs
 from train.runs.evaluate import N_ACTIONS
 from train.runs.folder import Run, sole_trainer
-from train.runs.task import Task, task_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +174,7 @@ def _begin(
     if env.spec != arm.spec:
         n, n_specified = (spec.structure.links_per_section for spec in (env.spec, arm.spec))
         console.print(f"the arm has {n} links per section in this run, {n_specified} in its specification")
-    task = task_of(config, env, None if log is None else from_log(log, arm.spec))
+    task = runs.task_of(config, env, None if log is None else from_log(log, arm.spec))
     first = runs.begin_with(task, config.seed, opened) if opened else None
     path = options.out or runs.free_path(Path("runs") / f"{command}-{options.preset}-seed{config.seed}")
     begins_with = {name: run.path for name, run in opened.items()}
@@ -191,7 +190,7 @@ def _resume(path: Path, console: Console) -> int:
     return _train(run, runs.task_of_run(run), console)
 
 
-def _train(run: Run, task: Task, console: Console) -> int:
+def _train(run: Run, task: runs.Task, console: Console) -> int:
     console.print(f"run: {run.path}", highlight=False, soft_wrap=True)
     try:
         with sole_trainer(run.path):
@@ -203,7 +202,7 @@ def _train(run: Run, task: Task, console: Console) -> int:
     return 0
 
 
-def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
+def _show(run: Run, task: runs.Task, summary: Any, console: Console) -> None:
     _table(f"{task.evaluate.title}, {N_ACTIONS} actions each", summary, console)
     for picture in sorted(run.path.glob("*.png")):
         console.print(f"picture: {picture}", highlight=False, soft_wrap=True)

@@ -22,7 +22,6 @@ from mjx_softarm.logs.files import LogError
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
-from train.agent.registry import learns_from_demonstrations
 from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
 
@@ -253,7 +252,7 @@ class Run:
         Raises:
             InputError: its file cannot be read.
         """
-        if not learns_from_demonstrations(self.config.learner):
+        if not self.config.learner.FROM_DEMONSTRATIONS:
             return None
         try:
             return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)

@@ -11,7 +11,6 @@ from calib.arm import CalibratedArm
 from calib.changes import MIN_TIP_MM
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.mdp.actions import SHIFT_LIMIT
-from train.agent.registry import learns_from_demonstrations
 from train.runs import run as runs
 from train.runs.folder import DEMONSTRATIONS_FILE, Run
 
@@ -68,7 +67,7 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
         console.print("enough without training")
         return True
     # The command that goes on, with the preset that the run began with; further settings are the user's
-    shown = learns_from_demonstrations(before.config.learner)
+    shown = before.config.learner.FROM_DEMONSTRATIONS
     task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if shown else "reach"
     preset = before.origin()["preset"]
     options = f"--agent {before.path} --calibration {calibration}" + (f" --preset {preset}" if preset else "")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from train.agent.imitation import goal_weights
-from train.agent.registry import epoch_of
 from train.epoch.job import Job
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -14,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 @pytest.fixture(scope="module")
 def epoch(imitation_config, short_env, shown):
-    return epoch_of(imitation_config.learner, short_env, shown)
+    return imitation_config.learner.make_epoch(short_env, shown)
 
 
 @pytest.fixture(scope="module")

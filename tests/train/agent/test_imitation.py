@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.agent.hindsight import HindsightConfig
+from train.agent.hindsight import HindsightConfig, relabel
 from train.agent.imitation import Imitation
 from train.agent.learner import Experience, Transition
-from train.epoch.replay_epoch import ReplayEpoch
 
 B = 16
 
@@ -39,7 +38,7 @@ def stored(short_env, shown):
 
 def relabelled(learner, stored):
     """The batch that an epoch makes of stored transitions."""
-    return ReplayEpoch(learner.config, learner.env, learner).relabel(stored, jax.random.PRNGKey(0))
+    return relabel(stored, jax.random.PRNGKey(0), learner.config.hindsight, learner.env)
 
 
 def test_the_experts_rows_are_right_answers_to_their_goals(new, short_env, stored):

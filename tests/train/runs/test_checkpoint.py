@@ -13,7 +13,6 @@ from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 from tests.train.small import LEARNER
 from train.agent.analytic import AnalyticConfig
-from train.agent.registry import epoch_of
 from train.config import TrainConfig
 from train.epoch.replay_epoch import ReplayState
 from train.runs.folder import Run
@@ -59,7 +58,7 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
         "imitation": config.learner,
     }
     for name, learner_config in configs.items():
-        learner = epoch_of(learner_config, short_env, shown).learner
+        learner = learner_config.make_epoch(short_env, shown).learner
         run = Run.create(tmp_path / name, config, CalibratedArm(short_env.spec))
         with pytest.raises(InputError, match="got no checkpoint, expected one"):
             run.policy()
