@@ -50,14 +50,17 @@ class NewRunOptions(ArmOptions):
     resume: cli.MaybePath = None
     """folder to continue; its own settings hold"""
 
-    def check_resume_alone(self, new: Any) -> None:
-        """Refuse settings beside `--resume`, by comparison with the options that a command begins with.
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
-        Raises:
-            InputError: there are some; the message names them.
-        """
-        names = _differing(self, new, ("resume", "config"))
-        names += _differing(getattr(self, "config", None), getattr(new, "config", None))
+    @classmethod
+    def default(cls, arguments: Sequence[str]) -> Self:
+        """Return the options that a command with these words begins with."""
+        raise NotImplementedError
+
+    def check_resume_alone(self) -> None:
+        """Raise InputError for settings beside `--resume`: those that differ from the command's own."""
+        new = self.default([])
+        names = _differing(self, new, ("resume", "config")) + _differing(self.config, new.config)
         if names:
             given = ", ".join(f"--{name}" for name in dict.fromkeys(names))
             raise InputError(f"--resume {self.resume}: got {given} too, expected none: its own settings hold")
@@ -73,7 +76,6 @@ class ReachOptions(NewRunOptions):
     """machine that the preset's numbers of arms, steps and transitions suit; gpu: of analytic and motion"""
     learner: Annotated[str, cli.one_of(n for n, c in LEARNERS.items() if not c.FROM_DEMONSTRATIONS)] = "tqc"
     """learner; where it is not the preset's, it begins with its own defaults"""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:

@@ -51,7 +51,7 @@ class Sweep(ReachOptions):
         console = start()
         # The members, of a folder or of these settings.
         if self.resume:
-            self.check_resume_alone(self.default([]))
+            self.check_resume_alone()
             path, runs = self.resume, open_members(self.resume)
             for run in (run for run in runs if run.checkpoints.latest is None):
                 run.check_begins_anew()

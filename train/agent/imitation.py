@@ -332,43 +332,30 @@ class DemonstratedGoals:
     ) -> ReplayState:
         """Return the state before an epoch: a stage begins, or goals shift to the largest errors.
 
+        As a stage begins, the state given is used up: its replay is thinned.
+
         Args:
             state: state of the run.
             epoch: number of epochs done.
             errors_mm: returns the tip errors (m,) at the positions.
         """
-        every = self.config.rebalance_epochs
-        if every and epoch and epoch % every == 0 and epoch not in self.config.stage_epochs:
-            return self.rebalance(state, epoch, errors_mm())
-        return self.begin_stage(state, epoch)
-
-    def begin_stage(self, state: ReplayState, epoch: int) -> ReplayState:
-        """Return the state with the goals of the stage that begins before an epoch, and a thinner replay.
-
-        It is the state as given where no stage begins; else the state given is used up.
-        """
-        if epoch not in self.config.stage_epochs:
-            return state
-        kept = self.config.stages[self.config.stage_epochs.index(epoch)].kept
-        if kept < 1.0 and epoch:
-            key, key_thin = jax.random.split(state.key)
-            memory = self._thin(state.memory, key_thin, jnp.asarray(kept, jnp.float32))
-            state = state._replace(memory=memory, key=key)
-        return state._replace(goals=jnp.asarray(self.of_stage(epoch), jnp.float32))
-
-    def rebalance(
-        self, state: ReplayState, epoch: int, error_mm: Sequence[float] | np.ndarray
-    ) -> ReplayState:
-        """Return the state with goals shifted to the positions (m,) with the largest errors [mm]."""
-        return state._replace(goals=jnp.asarray(goal_weights(error_mm, self.of_stage(epoch))))
+        every, stages = self.config.rebalance_epochs, self.config.stage_epochs
+        if epoch in stages:
+            kept = self.config.stages[stages.index(epoch)].kept
+            if kept < 1.0 and epoch:
+                key, key_thin = jax.random.split(state.key)
+                memory = self._thin(state.memory, key_thin, jnp.asarray(kept, jnp.float32))
+                state = state._replace(memory=memory, key=key)
+            return state._replace(goals=jnp.asarray(self.of_stage(epoch), jnp.float32))
+        if every and epoch % every == 0:
+            return state._replace(goals=jnp.asarray(goal_weights(errors_mm(), self.of_stage(epoch))))
+        return state
 
 
 def goal_weights(error_mm: Sequence[float] | np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Return how often each position is the goal: a share evenly, the rest in proportion to its error.
+    """Return how often each position is the goal: a share evenly, the rest in proportion to its error (m,).
 
-    Args:
-        error_mm (m,): tip errors at the positions now.
-        goals (m,) bool: positions that are goals at all.
+    `goals` (m,) bool marks the positions that are goals at all.
     """
     error = np.where(goals, error_mm, 0.0)
     by_error = error / error.sum() if error.sum() > 0 else goals / goals.sum()

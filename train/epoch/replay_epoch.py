@@ -144,7 +144,7 @@ class ReplayEpoch:
         # The replay has the shapes of the transitions that the arms will make.
         action = jax.eval_shape(self.learner.act, learner, arms.obs, key)
         experience = jax.eval_shape(self._experience, arms, action, arms)
-        one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), experience)
         memory = replay.create(one, self.config.replay_capacity)
         return ReplayState(arms, learner, memory, goals, key, n_epochs=jnp.zeros((), jnp.int32))
 

@@ -8,7 +8,7 @@ import json
 from collections import ChainMap
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -22,10 +22,9 @@ from mjx_softarm.policy.file import ArmModel, take_networks
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 from train.runs import estimator
-from train.runs.estimator import distil
+from train.runs.estimator import Errors, distil
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
-N_STEPS = estimator.N_STEPS + 1  # steps that `arm_model` reports: the networks' and the workspace
 SEED = 0  # seed of the networks and of the workspace
 ESTIMATORS_FILE, _KIND = "estimators.npz", "estimators"
 _NAMES = "estimator", "load_estimator", "spring_model"
@@ -35,7 +34,7 @@ class DistilledArm(NamedTuple):
     """A model of an arm, with the errors of its networks."""
 
     model: ArmModel
-    errors: dict[str, Any]  # by name and payload, in types that JSON has
+    errors: Errors
 
 
 _distilled: dict[str, DistilledArm] = {}  # by key, of this process
@@ -49,7 +48,7 @@ def arm_model(
     Args:
         arm: the arm, calibrated or not.
         folder: keeps the model in a file, which is used again for the same arm and the same code.
-        say: takes a text before each of `N_STEPS` steps; of none where the model is kept.
+        say: takes a text before each step; of none where the model is kept.
 
     Raises:
         SpecError: the arm settles at too few pressures.
@@ -59,13 +58,9 @@ def arm_model(
         return kept
     if key not in _distilled:
         distilled = distil(arm, SEED, say)
-        errors = {
-            name: {f"{kg:g} kg": error._asdict() for kg, error in by_payload.items()}
-            for name, by_payload in distilled.errors.items()
-        }
         say("simulating the workspace")
         model = ArmModel(_workspace(arm.spec, arm.s2r), *distilled[:3], arm.s2r)
-        _distilled[key] = DistilledArm(model, errors)
+        _distilled[key] = DistilledArm(model, distilled.errors)
     if file:
         with contextlib.suppress(SealedFileError):  # a folder to read only: the next export distils anew
             _write(file, key, _distilled[key])

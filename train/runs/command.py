@@ -39,8 +39,7 @@ class Reach(ReachOptions):
     def __call__(self) -> int:
         console = start()
         if self.resume:
-            self.check_resume_alone(self.default([]))
-            return _resume(self.resume, console)
+            return _resume(self, self.resume, console)
         return _begin("reach", self, self.config, {"agent": self.agent}, console)
 
 
@@ -56,7 +55,6 @@ class Imitate(NewRunOptions):
     preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
     """settings to begin with. pipe: the learned reward; circle: the learned reward and the environment's, in
     two stages; paper-circle, paper-pipe: the paper's own recipe"""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""
     reward: cli.MaybePath = None
@@ -70,8 +68,7 @@ class Imitate(NewRunOptions):
     def __call__(self) -> int:
         console = start()
         if self.resume:
-            self.check_resume_alone(self.default([]))
-            return _resume(self.resume, console)
+            return _resume(self, self.resume, console)
         if self.file is None:
             raise InputError("FILE: got nothing, expected the demonstrations, or --resume RUN")
         # Settings of the learned reward, which may be another run's.
@@ -154,13 +151,7 @@ def _begin(
 ) -> int:
     """Make a run and train it to its end; returns the exit status.
 
-    Args:
-        command: name of the command.
-        options: its options.
-        config: settings of the run.
-        donors: folders of runs that the new one takes parts of, `agent` and `reward`.
-        console: shows progress.
-        demonstrations: file of demonstrations, if it learns from these.
+    `donors` are folders of runs that the new one takes parts of, by the options `agent` and `reward`.
     """
     # The arm, the demonstrations, and the runs that the new one begins with.
     arm = options.read_arm(console)
@@ -182,7 +173,8 @@ def _begin(
     return _train(run, task, console)
 
 
-def _resume(path: Path, console: Console) -> int:
+def _resume(options: Reach | Imitate, path: Path, console: Console) -> int:
+    options.check_resume_alone()
     run = Run.open(path)
     if run.checkpoints.latest is None:
         run.check_begins_anew()

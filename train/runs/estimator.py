@@ -73,15 +73,8 @@ PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which error
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
 WIDTH = 128  # width of the networks' hidden layers
 LEAST_SCALE = 1e-6  # least scale of an output off its plane: without a log, one variance holds everywhere
-N_STEPS = 5  # steps that `distil` reports
-
-
-class Error(NamedTuple):
-    """Errors on held-out equilibria."""
-
-    median: float
-    p95: float
-    largest: float
+# Median, 95 % and largest error ("median", "p95", "largest") by quantity and payload, such as "0.5 kg"
+Errors = dict[str, dict[str, dict[str, float]]]
 
 
 class Distilled(NamedTuple):
@@ -90,7 +83,7 @@ class Distilled(NamedTuple):
     estimator: PoseEstimator
     load_estimator: LoadEstimator
     spring_model: SpringModel
-    errors: dict[str, dict[float, Error]]  # by quantity and payload [kg], see `_errors`
+    errors: Errors
 
 
 def distil(arm: CalibratedArm, seed: int, say: Callable[[str], object] = lambda step: None) -> Distilled:
@@ -99,7 +92,7 @@ def distil(arm: CalibratedArm, seed: int, say: Callable[[str], object] = lambda 
     Args:
         arm: the arm, calibrated or not.
         seed: seed of the equilibria, the initial weights and the batches.
-        say: takes a text before each of the `N_STEPS` steps.
+        say: takes a text before each step.
 
     Raises:
         ValueError: the seed draws the held-out equilibria.
@@ -111,11 +104,9 @@ def distil(arm: CalibratedArm, seed: int, say: Callable[[str], object] = lambda 
     # Fit the pose of the arm as specified
     say("fitting the pose estimator")
     estimator = fit_pose(spec, seed)
-    say("simulating poses with payloads")
-    loaded = loaded_poses(arm, N_TRAINING, seed)
     # Learn what holds the arm, with a payload and without, and the springs of the unloaded arm.
     say("training the payload estimator")
-    load_estimator = fit_load_estimator(arm, loaded, seed)
+    load_estimator = fit_load_estimator(arm, seed)
     say("training the model of the springs")
     unloaded = _as_measured(arm, sample_workspace(spec, N_TRAINING, seed))
     springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
@@ -192,11 +183,6 @@ def _first_estimator(spec: ArmSpec) -> PoseEstimator:
     return PoseEstimator(**{name: np.asarray(value, float) for name, value in fields.items()})
 
 
-def loaded_poses(arm: CalibratedArm, n: int, seed: int) -> LoadedPool:
-    """Draw n poses with payloads, of arms whose chambers are off if there was no log; see `distil`."""
-    return sample_loaded(arm.spec, _payloads(arm.spec, n, seed), _chambers_off(arm), seed)
-
-
 def _payloads(spec: ArmSpec, n: int, seed: int) -> np.ndarray:
     """Draw payloads [kg] of the candidates for n poses."""
     share = np.random.default_rng([seed, 1]).uniform(LOWEST, HIGHEST, CANDIDATES_PER_POSE * n)
@@ -208,9 +194,10 @@ def _chambers_off(arm: CalibratedArm) -> float:
     return CHAMBERS_OFF if arm.held is None else 0.0
 
 
-def fit_load_estimator(arm: CalibratedArm, loaded: LoadedPool, seed: int) -> LoadEstimator:
-    """Return the payload network of an arm, learned at the springs of `loaded_poses`; see `distil`."""
+def fit_load_estimator(arm: CalibratedArm, seed: int) -> LoadEstimator:
+    """Return the payload network of an arm, learned at poses with payloads; see `distil`."""
     spec, _, held = arm
+    loaded = sample_loaded(spec, _payloads(spec, N_TRAINING, seed), _chambers_off(arm), seed)
     own_kg, n_sections = spec.mass.payload_kg, spec.structure.n_sections
     # Pressures that hold the springs without a payload, and their change by one
     at, both = held_at(arm, np.asarray(loaded.spring_m))
@@ -385,13 +372,13 @@ def _scaling(name: str, unit: str, values: Array) -> dict[str, Array]:
     }
 
 
-def _errors(learned: Distilled, arm: CalibratedArm) -> dict[str, dict[float, Error]]:
+def _errors(learned: Distilled, arm: CalibratedArm) -> Errors:
     """Return errors by payload on top of the specification's.
 
     `tip_mm` and `turn_deg` are errors of the estimated pose with the true load. `load_kg` is the error of
     arms whose chambers are off, `spring_mm` the error of each arm's worst spring.
     """
-    spec, errors_by_name = arm.spec, dict[str, dict[float, Error]]()
+    spec, errors_by_name = arm.spec, Errors()
     for share in PAYLOADS:
         payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
@@ -418,6 +405,7 @@ def _errors(learned: Distilled, arm: CalibratedArm) -> dict[str, dict[float, Err
             "spring_mm": 1e3 * springs.max(axis=-1),
         }
         for name, values in errors.items():
-            quantiles = (float(np.quantile(values, share)) for share in (0.5, 0.95, 1.0))
-            errors_by_name.setdefault(name, {})[payload_kg] = Error(*quantiles)
+            shares = {"median": 0.5, "p95": 0.95, "largest": 1.0}
+            quantiles = {label: float(np.quantile(values, share)) for label, share in shares.items()}
+            errors_by_name.setdefault(name, {})[f"{payload_kg:g} kg"] = quantiles
     return errors_by_name

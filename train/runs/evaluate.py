@@ -1,6 +1,7 @@
-"""Evaluation of a policy on two sets of held-out goals over the whole workspace, and on the paper's circle.
+"""Evaluation of a policy: at held-out goals and on the paper's circle, or at demonstrated positions.
 
-The first set has random pressures and is rarely near the rim; the second is uniform in volume, rim included.
+There are two sets of held-out goals. The first has random pressures and is rarely near the rim; the second is
+uniform in volume, rim included.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
+from mjx_softarm.sensing.pose import pose_error
+from train.demos.demonstrations import Demonstrations
 
 N_GOALS = 2_000
 NEAR_MM = 5.0  # tip error of an arm that has arrived, in motion
@@ -223,12 +226,9 @@ def reach(
 
 
 def time_near(way_mm: Array, goal_mm: Array, period_s: float) -> Array:
-    """Return when a tip came near its goal for good, () [s].
+    """Return when a tip came near its goal (3,) for good, () [s].
 
-    Args:
-        way_mm (t, 3): positions of the tip, a control period apart, the first where it began.
-        goal_mm (3,): the goal.
-        period_s: control period.
+    Its positions `way_mm` (t, 3) are a control period apart, the first where it began.
     """
     far = jnp.linalg.norm(way_mm - goal_mm, axis=-1) > NEAR_MM
     last_far = jnp.max(jnp.where(far, jnp.arange(1, len(way_mm) + 1), 0))
@@ -291,3 +291,102 @@ def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: flo
         circle_saturated_chambers=int(np.sum(circle.saturated_chambers)),
         **motion,
     )
+
+
+class AtPositions(NamedTuple):
+    """Results at m demonstrated positions, in their order."""
+
+    reached: Reached  # (m, ...)
+    success: np.ndarray  # (m,) bool: close enough, no chamber saturated, the body inside the pipe
+
+
+@dataclass(frozen=True)
+class PositionSummary(Figures):
+    """Figures at demonstrated positions."""
+
+    error_mm: tuple[float, ...]  # tip error at each position
+    success: tuple[bool, ...]  # of each position
+    success_share: float = figure("positions with success", "%", 1)
+    success_first_share: float = figure("positions of the first stage with success", "%", 1)
+    reached_share: float = figure("positions reached", "%", 1)  # with or without saturation and contact
+    median_mm: float = figure("tip error, median", "mm", 2)
+    max_mm: float = figure("tip error, largest", "mm", 2)
+    x_mm: float = figure("mean absolute error in x", "mm", 2)
+    y_mm: float = figure("mean absolute error in y", "mm", 2)
+    z_mm: float = figure("mean absolute error in z", "mm", 2)
+    saturated_positions: int = figure("positions with a saturated chamber", "")
+    outside_positions: int = figure("positions with the body outside the pipe", "")
+    unsettled: int = figure("arms that did not settle", "")
+
+
+class PositionEvaluator:
+    """Evaluate policies on m demonstrated positions, one after another; compiled once.
+
+    An action leads to the same pose from every start, so one arm without randomisation goes from position to
+    position. Its second pass counts. `first` (m,) bool marks the positions that are goals of the first
+    stage. Goals are corrected as in `Evaluator`.
+    """
+
+    def __init__(
+        self,
+        env: ReachEnv,
+        learner: Any,
+        demonstrations: Demonstrations,
+        first: np.ndarray,
+        n_actions: int = N_ACTIONS,
+        shift_limit: np.ndarray = UNCORRECTED,
+    ):
+        self.learner, self.demonstrations, self.first = learner, demonstrations, first
+        self.positions = np.asarray(demonstrations.positions, np.float32)  # (m, 6)
+        self.env = nominal(env)
+        self._go = xla.jit(follower(self.env, learner, n_actions, shift_limit))
+
+    def on(
+        self, env: ReachEnv, n_actions: int = N_ACTIONS, shift_limit: np.ndarray = UNCORRECTED
+    ) -> PositionEvaluator:
+        """Return the same evaluation on another environment."""
+        return PositionEvaluator(env, self.learner, self.demonstrations, self.first, n_actions, shift_limit)
+
+    @property
+    def title(self) -> str:
+        """Title of the table of figures."""
+        return f"{len(self.positions)} demonstrated positions"
+
+    def headline(self, row: dict[str, float]) -> str:
+        """Return a short text for a row of metrics with an evaluation."""
+        share, median_mm = row["evaluation/success_share"], row["evaluation/median_mm"]
+        return f"success at {100 * share:.0f} % of the positions, median {median_mm:.1f} mm"
+
+    def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
+        """Return figures, and results as NumPy arrays."""
+        policy, m = jax.device_get(policy), len(self.positions)  # it may be on many devices
+        passes = jax.device_get(self._go(policy, np.tile(self.positions, (2, 1)), start_keys(1)[0]))
+        second = jax.tree.map(lambda x: x[m:], passes)
+        return summarise_positions(second, self.env.config.reward.threshold, self.first)
+
+
+def summarise_positions(
+    reached: Reached, threshold: float, first: np.ndarray
+) -> tuple[PositionSummary, AtPositions]:
+    """Return the figures of results at m positions; `first` (m,) bool marks the goals of the first stage."""
+    close = reached.scaled_error < threshold  # (m,)
+    saturated, outside = reached.saturated_chambers > 0, reached.clearance_mm <= 0.0
+    success = close & ~saturated & ~outside & reached.settled
+    error_mm = reached.tip_error_mm
+    x, y, z = np.abs(pose_error(reached.pose, reached.goal))[..., :3].mean(axis=0)
+    figures = PositionSummary(
+        success_share=float(success.mean()),
+        success_first_share=float(success[first].mean()),
+        reached_share=float(close.mean()),
+        median_mm=float(np.median(error_mm)),
+        max_mm=float(error_mm.max()),
+        x_mm=float(x),
+        y_mm=float(y),
+        z_mm=float(z),
+        saturated_positions=int(np.count_nonzero(saturated)),
+        outside_positions=int(np.count_nonzero(outside)),
+        unsettled=int(np.count_nonzero(~reached.settled)),
+        error_mm=tuple(float(value) for value in error_mm),
+        success=tuple(bool(value) for value in success),
+    )
+    return figures, AtPositions(reached, np.asarray(success))

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.archive import Entries, layer_entries, write_sealed
@@ -109,7 +108,7 @@ def _export(
     """Write the policy of a run; return whether it needs no training on a later calibration."""
     from mjx_softarm.export.write import export_cpp, export_onnx
     from train.options import ArmOptions, start
-    from train.runs.arm_model import N_STEPS, arm_model
+    from train.runs.arm_model import arm_model
     from train.runs.renew import policy_still_accurate, renewed
 
     start()
@@ -121,16 +120,7 @@ def _export(
         enough = policy_still_accurate(run, later, calibration, console)
         run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
     # Distil the arm's networks, unless they are kept
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("reading the arm's networks", total=N_STEPS)
-
-        def say(step: str) -> None:
-            progress.update(bar, description=step, advance=1)
-            if not console.is_terminal:
-                console.print(f"{step} ...")
-
-        arm = arm_model(run.arm, keeps, say)
+    arm = arm_model(run.arm, keeps, lambda step: console.print(f"{step} ..."))
     policy = export_run(run, arm, file)
     # Say what was written
     console.print(f"policy: {policy}, {_size(policy)}")

@@ -10,8 +10,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from train.runs.evaluate import Reached
-from train.runs.positions import AtPositions
+from train.runs.evaluate import AtPositions, Reached
 
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
 DPI = 150

@@ -22,9 +22,8 @@ from train.agent.learner import LearnerConfig
 from train.config import TrainConfig, name_of
 from train.demos.demonstrations import Demonstrations
 from train.epoch.job import FreshPoses, Job, State
-from train.runs.evaluate import Evaluator
+from train.runs.evaluate import Evaluator, PositionEvaluator
 from train.runs.folder import EVALUATION_FILE, Run
-from train.runs.positions import PositionEvaluator
 
 
 class Task(NamedTuple):

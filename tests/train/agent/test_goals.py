@@ -33,7 +33,7 @@ def run(job, goals):
     def train(state, first, last):
         metrics = {}
         for k in range(first, last):
-            state, metrics = job.epoch(goals.begin_stage(state, k))
+            state, metrics = job.epoch(goals.prepare(state, k, lambda: np.ones(6)))
         return state, metrics
 
     return train
@@ -57,7 +57,7 @@ def test_stages_change_the_goals_and_thin_the_replay(job, goals, run):
     state, _ = run(job.init(jax.random.PRNGKey(0)), 0, 4)
     n = int(state.memory.size)
     assert n == 64 and set(indices(goals, state.memory.data.goal)) <= {0, 2, 4}
-    later = goals.begin_stage(jax.tree.map(jnp.copy, state), 4)
+    later = goals.prepare(jax.tree.map(jnp.copy, state), 4, lambda: np.ones(6))
     assert int(later.memory.size) == n // 4 and np.all(later.goals == 1.0)
     state, _ = run(state, 4, 8)
     assert {1, 3, 5} & set(indices(goals, state.memory.data.goal))
@@ -80,7 +80,8 @@ def test_goals_shift_to_the_positions_that_are_missed_by_most():
 
 
 def test_rebalanced_goals_are_drawn_by_their_weights(job, goals):
-    state = goals.rebalance(job.init(jax.random.PRNGKey(0)), 4, np.array([0.0, 0, 0, 0, 0, 10.0]))
+    errors_mm = np.array([0.0, 0, 0, 0, 0, 10.0])
+    state = goals.prepare(job.init(jax.random.PRNGKey(0)), 6, lambda: errors_mm)  # every third epoch
     arms = jax.jit(jax.vmap(lambda key: goals.begin(state.goals, state.arms, key)))
     drawn = arms(jax.random.split(jax.random.PRNGKey(5), 500)).pipeline_state.goal.reshape(-1, 6)
     share = np.mean(indices(goals, drawn) == 5)

@@ -194,7 +194,8 @@ def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env
     moving = stored._replace(sensed=before, next_sensed=after)
     config, key = HindsightConfig(reached_share=1.0), jax.random.key(0)
     motion = copy.copy(env)
-    motion.config = dataclasses.replace(env.config, mode="dynamic", observation="motion", goal_ends=False)
+    changes = {"engine": "mjx", "mode": "dynamic", "observation": "motion", "goal_ends": False}
+    motion.config = dataclasses.replace(env.config, **changes)
     batch = relabel(moving, key, config, motion)
     np.testing.assert_array_equal(batch.obs[:, 18:], before)
     n_springs = batch.action.shape[1]

@@ -183,7 +183,7 @@ RECORD = ("record", "--arm", "a:B", "--out")
 
 def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monkeypatch, waypoints):
     _, pipe = task("pipe300", SPEC)
-    monkeypatch.setattr("train.demos.command.task", lambda name, spec: (waypoints[:2], pipe))
+    monkeypatch.setattr("train.demos.record.task", lambda name, spec: (waypoints[:2], pipe))
     out = tmp_path / "demos.csv"
     status, printed = command(*RECORD, out, "--task", "pipe300")
     assert status == 0, printed

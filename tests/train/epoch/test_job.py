@@ -119,7 +119,7 @@ def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tm
         run.checkpoints.restore(state)
     run.checkpoints.save(0, state, job.learner.parts(state.learner))
     for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
-        with pytest.raises(InputError, match=f"{tmp_path}: got a checkpoint of other parts or sizes"):
+        with pytest.raises(InputError, match=f"{tmp_path}/.*: got .* of other parts or sizes"):
             run.checkpoints.restore(other)
 
 

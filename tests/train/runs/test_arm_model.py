@@ -7,12 +7,12 @@ import pytest
 from calib.arm import CalibratedArm
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.runs import arm_model
-from train.runs.estimator import Distilled, Error
+from train.runs.estimator import Distilled
 
 POLICY = load_policy(SHIPPED)
 
 
-ERRORS = {"tip_mm": {0.0: Error(1.0, 2.0, 3.0)}}
+ERRORS = {"tip_mm": {"0 kg": {"median": 1.0, "p95": 2.0, "largest": 3.0}}}
 
 
 @pytest.fixture(autouse=True)

@@ -21,7 +21,7 @@ from mjx_softarm.sensing.estimator import POSE_ERROR_MM, estimate_frame, expecte
 from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.pose import frame_from_pose
 from train.runs import estimator as module
-from train.runs.estimator import PAYLOADS, distil, fit_load_estimator, fit_pose, loaded_poses
+from train.runs.estimator import PAYLOADS, distil, fit_load_estimator, fit_pose
 
 SPEC = ArmSpec.default()
 N, N_ARMS = SPEC.n_chambers, 512
@@ -57,20 +57,20 @@ def test_tips_are_those_of_c_mujoco(distilled, pool):
         )
         away_mm.append(1e3 * np.linalg.norm(frame.position_m - data.site("tip").xpos))
     assert np.median(away_mm) < 0.05 and max(away_mm) < 0.5
-    assert np.median(away_mm) == pytest.approx(distilled.errors["tip_mm"][0.0].median, rel=0.25)
+    assert np.median(away_mm) == pytest.approx(distilled.errors["tip_mm"]["0 kg"]["median"], rel=0.25)
 
 
 def test_springs_of_known_pressures(distilled, pool):
     off_mm = 1e3 * np.abs(expected_springs(distilled.spring_model, pool.pressure_kpa) - pool.spring_m).max(1)
     assert np.median(off_mm) < 5.0
-    assert np.median(off_mm) == pytest.approx(distilled.errors["spring_mm"][0.0].median, rel=0.25)
+    assert np.median(off_mm) == pytest.approx(distilled.errors["spring_mm"]["0 kg"]["median"], rel=0.25)
 
 
 def test_errors_are_given_by_payload(distilled):
     for errors in distilled.errors.values():
-        assert tuple(errors) == PAYLOADS
-        assert all(0.0 < error.median < error.p95 < error.largest for error in errors.values())
-    medians = [distilled.errors["spring_mm"][payload_kg].median for payload_kg in PAYLOADS]
+        assert tuple(errors) == tuple(f"{payload_kg:g} kg" for payload_kg in PAYLOADS)
+        assert all(0.0 < error["median"] < error["p95"] < error["largest"] for error in errors.values())
+    medians = [error["median"] for error in distilled.errors["spring_mm"].values()]
     assert medians == sorted(medians)
 
 
@@ -184,7 +184,7 @@ def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_cali
     measured_kpa = rows.pressure_kpa + hardening(rows.spring_m)
     held = fit_held_pressures(spec, rows.spring_m, measured_kpa, rows.pressure_kpa).held
     arm = CalibratedArm(spec, held=held._replace(factor=0.9, factor_sd=0.03))
-    found = fit_load_estimator(arm, loaded_poses(arm, module.N_TRAINING, 0), 0)
+    found = fit_load_estimator(arm, 0)
     assert found.factor_sd == pytest.approx(0.03)
     loaded = jax.device_get(sample_workspace(SPEC.replace(mass={"payload_kg": 0.45}), N_ARMS, 79))
     for arms, payload_kg in ((others, 0.0), (loaded, 0.5)):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import ReachEnv
-from train.runs.evaluate import Reached
-from train.runs.positions import PositionEvaluator, summarise
+from train.runs.evaluate import PositionEvaluator, Reached, summarise_positions
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -58,7 +57,7 @@ def test_positions_with_saturation_or_a_body_outside_are_counted():
     saturated, clearance_mm = np.array([0, 2, 0, 0]), np.array([5.0, 5, -1, 5])
     settled = np.array([True, True, True, False])
     reached = Reached(poses, poses, zero, saturated, settled, zero, clearance_mm, zero)
-    figures, at = summarise(reached, 0.03, np.array([True, True, False, False]))
+    figures, at = summarise_positions(reached, 0.03, np.array([True, True, False, False]))
     assert (figures.saturated_positions, figures.outside_positions, figures.unsettled) == (1, 1, 1)
     assert figures.success == (True, False, False, False) == tuple(at.success)
     assert (figures.success_share, figures.success_first_share) == (0.25, 0.5)  # of all, of the first stage
