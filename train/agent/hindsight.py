@@ -88,15 +88,10 @@ def relabel(batch: Experience, key: Array, config: HindsightConfig, env: ReachEn
 
 
 def later_pose(now: Experience, later: Experience, ahead: Array) -> Array:
-    """Return the poses (B, 6) [mm, deg] that transitions reached some actions later in the same episode.
+    """Return the poses (B, 6) [mm, deg] that B transitions reached some actions later in the same episode.
 
-    Args:
-        now: B transitions.
-        later: B transitions that may be of the same episodes.
-        ahead (B,): number of additions to the replay between the two.
-
-    `later` is of the same episode if it has the same goal and `ahead` more actions. Else the pose is that of
-    the transition itself.
+    `ahead` (B,) counts additions to the replay between `now` and `later`, which is of the same episode if it
+    has the same goal and `ahead` more actions. Else the pose is that of the transition itself.
     """
     same = (later.n_steps == now.n_steps + ahead) & jnp.all(later.goal == now.goal, axis=-1)
     return jnp.where(same[:, None], later.next_pose, now.next_pose)
@@ -105,9 +100,7 @@ def later_pose(now: Experience, later: Experience, ahead: Array) -> Array:
 def near_offsets(distance: Array, direction: Array) -> Array:
     """Return offsets (n, 6) [mm, deg]: random directions, log-uniform lengths, and turns.
 
-    Args:
-        distance (n,): uniform draws in [0, 1).
-        direction (n, 6): normal draws.
+    `distance` (n,) are uniform draws in [0, 1), `direction` (n, 6) normal draws.
 
     A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
     tail: some goals are turned further than the arm can turn, as a user's goals may be.

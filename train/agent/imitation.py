@@ -232,11 +232,7 @@ class Imitation:
         return parts if state.discriminator is None else parts | {"reward": state.discriminator.params}
 
     def adopt(self, state: ImitationState, parts: Mapping[str, Any]) -> ImitationState:
-        """Return the state with a learned reward, with networks of TQC, or with both.
-
-        Raises:
-            ValueError: a part has another size, or the networks are not those of TQC.
-        """
+        """Return the state with a learned reward, with networks of TQC, or with both."""
         networks = {name: part for name, part in parts.items() if name != "reward"}
         if networks:
             state = state._replace(agent=self.tqc.adopt(state.agent, networks))
@@ -251,12 +247,8 @@ class Imitation:
     ) -> tuple[Array, dict[str, Array]]:
         """Return the rewards (B,) of a batch, and metrics.
 
-        The cost of the body's clearance is charged whatever the weights; the expert keeps clear.
-
-        Args:
-            batch: batch, the expert's rows first.
-            without_reward (B,) bool: rows whose goal the discriminator does not know.
-            discriminator: discriminator that gives the learned reward, if there is one.
+        The cost of the body's clearance is charged whatever the weights; the expert, in the first rows, keeps
+        clear. `without_reward` (B,) bool marks rows whose goal the discriminator does not know.
         """
         assert batch.stored is not None
         cost = batch.stored.clearance_cost.at[: self.n_expert].set(0.0)  # (B,)
@@ -332,12 +324,8 @@ class DemonstratedGoals:
     ) -> ReplayState:
         """Return the state before an epoch: a stage begins, or goals shift to the largest errors.
 
-        As a stage begins, the state given is used up: its replay is thinned.
-
-        Args:
-            state: state of the run.
-            epoch: number of epochs done.
-            errors_mm: returns the tip errors (m,) at the positions.
+        As a stage begins, the state given is used up: its replay is thinned. `epoch` is the number of epochs
+        done; `errors_mm` returns the tip errors (m,) at the positions.
         """
         every, stages = self.config.rebalance_epochs, self.config.stage_epochs
         if epoch in stages:

@@ -73,19 +73,13 @@ class WaypointRecorder:
         self._rows, self._off_m = Recorder(), []
         self._readings = np.empty(0)  # (n_springs,) of the newest tick
 
-    def record(self, waypoints: Sequence[Waypoint], plan: Posture, sequence: int = 0) -> RecordedPoses:
-        """Bring the finger tips to waypoints, log each, and vent; see `vent_at_end`.
-
-        Args:
-            waypoints: one after the other.
-            plan: postures (n,) at the waypoints, by `Expert.plan`.
-            sequence: id of the demonstration.
-        """
+    def record(self, waypoints: Sequence[Waypoint], plan: Posture) -> RecordedPoses:
+        """Bring the finger tips to waypoints as `Expert.plan` planned, log each, and vent at the end."""
 
         def run() -> None:
             for k, waypoint in enumerate(waypoints):
                 row, off_m = self._reach(waypoint, jax.tree.map(lambda x, k=k: x[k], plan))
-                self._rows.add(row | {"sequence": sequence})
+                self._rows.add(row | {"sequence": 0})
                 self._off_m.append(off_m)
                 seen = f"{1e3 * off_m:.1f} mm off" if np.isfinite(off_m) else "not seen"
                 self.report(f"{len(self._rows)} of {len(waypoints)}: {waypoint.name}: {seen}")
@@ -134,12 +128,9 @@ class WaypointRecorder:
     def _corrected(
         self, row: dict, target: PostureTarget, asked: PostureTarget
     ) -> tuple[float, PostureTarget]:
-        """Return the error [m] of the finger tips, NaN if not seen, and the target to ask the expert for.
+        """Return the error [m] of the finger tips, NaN if not seen, and the next target of the expert.
 
-        Args:
-            row: row at rest.
-            target: target of the waypoint.
-            asked: target for which the expert found the present posture.
+        `asked` is the target for which the expert found the present posture.
         """
         if "tip_m" not in row:
             return np.nan, asked

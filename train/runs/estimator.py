@@ -325,12 +325,8 @@ def _first_load_estimator(
 ) -> LoadEstimator:
     """Return the payload network of an arm, with the plane that fits its outputs best.
 
-    Args:
-        arm: the arm, whose residual pressures tell the hysteresis.
-        spring_m (n, n_springs) [m]: spring lengths.
-        out (n, n_out): outputs of `LoadEstimator` there.
-        covariance_kpa2 (n_sections, c, c): covariance of the residual pressures.
-        key: key of the weights.
+    `out` (n, n_out) are the outputs of `LoadEstimator` at spring lengths (n, n_springs). The arm's residual
+    pressures, with covariance (n_sections, c, c), tell the hysteresis.
     """
     scaling, centre = _scaling("spring", "m", spring_m), jnp.mean(out, axis=0)
     springs = (spring_m - scaling["spring_centre_m"]) / scaling["spring_scale_m"]

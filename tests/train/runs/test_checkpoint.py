@@ -85,7 +85,7 @@ def test_a_damaged_checkpoint_is_called_so(saved, item, files):
     folder = run.path / "checkpoints/20" / item
     for file in folder.glob(files):
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(InputError, match=rf"{folder}: got a damaged checkpoint .*back to epoch 10"):
+    with pytest.raises(InputError, match=rf"{folder}: got a damaged checkpoint.*back to epoch 10"):
         reopened = Run.open(run.path)
         reopened.checkpoints.parts() if item == "parts" else reopened.checkpoints.restore(like)
 
