@@ -28,7 +28,7 @@ def distil_little(monkeypatch):
     """Distil the networks of an arm from few poses, in seconds; test_estimator asks how exact they are."""
     few = {"N_TRAINING": 512, "N_JUDGING": 256, "N_HELD_OUT": 64, "PAYLOADS": (0.0,)}
     for name, value in {**few, "SCHEDULE": Schedule(10, 4e-3, 256)}.items():
-        monkeypatch.setattr(f"train.runs.estimator.{name}", value)
+        monkeypatch.setattr(f"train.runs.arm_model.{name}", value)
 
 
 def flags(**changes):

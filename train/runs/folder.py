@@ -18,7 +18,6 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.files import read_json_lines, replacing
 from mjx_softarm._support.lazy import LazyModule
 from mjx_softarm._support.provenance import provenance, write_json
-from mjx_softarm.logs.files import LogError
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
@@ -221,14 +220,11 @@ class Run:
         """Return the demonstrations that the run learns from, or None.
 
         Raises:
-            InputError: its file cannot be read.
+            LogError: its file cannot be used.
         """
         if not self.config.learner.FROM_DEMONSTRATIONS:
             return None
-        try:
-            return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
-        except LogError as error:
-            raise InputError(str(error)) from error
+        return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
 
     def policy(self) -> Any:
         """Return the parameters of the newest checkpoint's policy; see `Checkpoints.parts`."""
