@@ -37,7 +37,7 @@ class ArmOptions:
         arm = CalibratedArm.read(self.calibration)
         if arm.s2r is None:
             absent = self.calibration / S2R_FILE
-            console.print(f"no {absent}: training on simulated poses", highlight=False, soft_wrap=True)
+            console.print(f"no {absent}: training on simulated poses", soft_wrap=True)
         return arm
 
 
@@ -50,17 +50,11 @@ class NewRunOptions(ArmOptions):
     resume: cli.MaybePath = None
     """folder to continue; its own settings hold"""
 
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
-
-    @classmethod
-    def default(cls, arguments: Sequence[str]) -> Self:
-        """Return the options that a command with these words begins with."""
-        raise NotImplementedError
-
     def check_resume_alone(self) -> None:
         """Raise InputError for settings beside `--resume`: those that differ from the command's own."""
-        new = self.default([])
-        names = _differing(self, new, ("resume", "config")) + _differing(self.config, new.config)
+        command: Any = self  # each has `config` and `default`
+        new = command.default([])
+        names = _differing(command, new, ("resume", "config")) + _differing(command.config, new.config)
         if names:
             given = ", ".join(f"--{name}" for name in dict.fromkeys(names))
             raise InputError(f"--resume {self.resume}: got {given} too, expected none: its own settings hold")
@@ -76,6 +70,7 @@ class ReachOptions(NewRunOptions):
     """machine that the preset's numbers of arms, steps and transitions suit; gpu: of analytic and motion"""
     learner: Annotated[str, cli.one_of(n for n, c in LEARNERS.items() if not c.FROM_DEMONSTRATIONS)] = "tqc"
     """learner; where it is not the preset's, it begins with its own defaults"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
@@ -104,4 +99,4 @@ def named(arguments: Sequence[str], option: str, names: Iterable[str], default: 
 def start() -> Console:
     """Turn on the cache of compiled programs; returns the console to print to."""
     xla.enable_compilation_cache()
-    return Console()
+    return Console(highlight=False, markup=False)

@@ -62,16 +62,16 @@ class Sweep(ReachOptions):
                 raise InputError(f"--out: got {path}, which exists, expected a new folder, or --resume")
             arm, preset = self.read_arm(console), self.preset
             runs = [Run.create(path / name, members[name], arm, preset=preset) for name in sorted(members)]
-        console.print(f"sweep: {path}, {len(runs)} members", highlight=False)
+        console.print(f"sweep: {path}, {len(runs)} members")
         # Train all of them, and report.
         try:
             with sole_trainer(path):
                 train(path, runs, console)
         except Interrupted as stop:
-            console.print(str(stop), highlight=False)
+            console.print(str(stop))
             return cli.INTERRUPTED
         console.print(report(path, runs))
-        console.print(f"results: {path / RESULTS_FILE}", highlight=False, soft_wrap=True)
+        console.print(f"results: {path / RESULTS_FILE}", soft_wrap=True)
         return 0
 
 

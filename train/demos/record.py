@@ -214,7 +214,7 @@ class Check(ArmOptions):
 
 
 def _print(console: Console, text: str) -> None:
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    console.print(text, soft_wrap=True)
 
 
 def _summary(log: Log, spec: ArmSpec) -> list[str]:

@@ -55,6 +55,7 @@ class Imitate(NewRunOptions):
     preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
     """settings to begin with. pipe: the learned reward; circle: the learned reward and the environment's, in
     two stages; paper-circle, paper-pipe: the paper's own recipe"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""
     reward: cli.MaybePath = None
@@ -137,7 +138,7 @@ def evaluate(
     _table(f"{task.evaluate.title}, {how}", summary, console)
     file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())
-    console.print(f"written: {file}", highlight=False, soft_wrap=True)
+    console.print(f"written: {file}", soft_wrap=True)
     return 0
 
 
@@ -178,17 +179,17 @@ def _resume(options: Reach | Imitate, path: Path, console: Console) -> int:
     run = Run.open(path)
     if run.checkpoints.latest is None:
         run.check_begins_anew()
-        console.print(f"{path}: no checkpoint yet, the run begins anew", highlight=False, soft_wrap=True)
+        console.print(f"{path}: no checkpoint yet, the run begins anew", soft_wrap=True)
     return _train(run, runs.task_of_run(run), console)
 
 
 def _train(run: Run, task: runs.Task, console: Console) -> int:
-    console.print(f"run: {run.path}", highlight=False, soft_wrap=True)
+    console.print(f"run: {run.path}", soft_wrap=True)
     try:
         with sole_trainer(run.path):
             summary = runs.train(run, task, console)
     except runs.Interrupted as stop:
-        console.print(str(stop), highlight=False)
+        console.print(str(stop))
         return cli.INTERRUPTED
     _show(run, task, summary, console)
     return 0
@@ -197,7 +198,7 @@ def _train(run: Run, task: runs.Task, console: Console) -> int:
 def _show(run: Run, task: runs.Task, summary: Any, console: Console) -> None:
     _table(f"{task.evaluate.title}, {N_ACTIONS} actions each", summary, console)
     for picture in sorted(run.path.glob("*.png")):
-        console.print(f"picture: {picture}", highlight=False, soft_wrap=True)
+        console.print(f"picture: {picture}", soft_wrap=True)
 
 
 def _table(title: str, summary: Any, console: Console) -> None:

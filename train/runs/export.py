@@ -135,12 +135,11 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
     """Write the policy of a run's newest checkpoint; return the file.
 
     Args:
-        run: folder with config and checkpoint.
+        run: folder with config and checkpoint; `actor_of` tells whether its policy can be written.
         arm: model of the run's arm, as `arm_model` makes it of `run.arm`.
         path: file to write; `policy.npz` in the run by default.
 
     Raises:
-        InputError: the run has no checkpoint, or its learner's policy is no network of the file's form.
         SealedFileError: the file cannot be written.
     """
     # Say how the policy came about: the run's config with versions and commit, and the arm's networks.
@@ -151,21 +150,18 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
     # Put all together; this checks the shapes of the parameters.
-    env, params = run.config.env, run.policy()
-    try:
-        policy = policy_from_actor(
-            params,
-            run.spec,
-            env.reward,
-            arm.model,
-            provenance,
-            activation=run.config.learner.activation,
-            observation=env.observation,
-            n_actions=N_ACTIONS,
-            action_s=env.dynamic_step_s if env.in_motion else 0.0,
-        )
-    except (ValueError, AttributeError) as error:
-        raise InputError(f"{run.path}: {error}") from error
+    env = run.config.env
+    policy = policy_from_actor(
+        run.policy(),
+        run.spec,
+        env.reward,
+        arm.model,
+        provenance,
+        activation=run.config.learner.activation,
+        observation=env.observation,
+        n_actions=N_ACTIONS,
+        action_s=env.dynamic_step_s if env.in_motion else 0.0,
+    )
     path = path or run.path / "policy.npz"
     save_policy(path, policy)
     return path

@@ -62,7 +62,7 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
             f"{new[name]:.2f} mm on the later one",
             highlight=False,
         )
-    console.print(f"besides, simulation is about {models_mm:.2f} mm off the arm", highlight=False)
+    console.print(f"besides, simulation is about {models_mm:.2f} mm off the arm")
     if all(np.hypot(new[name], models_mm) <= ENOUGH * np.hypot(old[name], models_mm) for name in old):
         console.print("enough without training")
         return True
@@ -71,9 +71,7 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
     task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if shown else "reach"
     preset = before.origin()["preset"]
     options = f"--agent {before.path} --calibration {calibration}" + (f" --preset {preset}" if preset else "")
-    console.print(
-        f"NOT enough: go on training: python -m train {task} {options}", highlight=False, soft_wrap=True
-    )
+    console.print(f"NOT enough: go on training: python -m train {task} {options}", soft_wrap=True)
     return False
 
 

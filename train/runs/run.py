@@ -277,7 +277,7 @@ def shown_progress(
         def show(epoch: int, text: str, due: bool) -> None:
             progress.update(bar, completed=epoch, text=text)
             if due and hidden:
-                console.print(f"epoch {epoch} of {config.learner.n_epochs}: {text}", highlight=False)
+                console.print(f"epoch {epoch} of {config.learner.n_epochs}: {text}")
 
         yield show
 

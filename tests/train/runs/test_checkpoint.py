@@ -90,17 +90,6 @@ def test_a_damaged_checkpoint_is_called_so(saved, item, files):
         reopened.checkpoints.parts() if item == "parts" else reopened.checkpoints.restore(like)
 
 
-def test_a_run_without_its_checkpoints_begins_anew_only_if_it_had_none(tmp_path):
-    run = Run.create(tmp_path, CONFIG, ARM)
-    for epoch in range(1, CONFIG.evaluation_epochs + 1):
-        run.check_begins_anew()  # it may have died before the checkpoint of the last epoch
-        run.log({"epoch": epoch})
-    run.check_begins_anew()
-    run.log({"epoch": CONFIG.evaluation_epochs + 1})
-    with pytest.raises(InputError, match="got no checkpoint of a run with 11 epochs .*another --out"):
-        run.check_begins_anew()
-
-
 def test_a_run_that_began_with_another_s_policy_does_not_begin_anew_without_it(tmp_path):
     run = Run.create(tmp_path, CONFIG, ARM, begins_with={"agent": tmp_path / "other"})
     with pytest.raises(InputError, match="got no checkpoint of a run with 0 epochs"):
