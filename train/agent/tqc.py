@@ -4,16 +4,8 @@ Kuznetsov et al. 2020, arXiv:2005.04269, on top of soft actor-critic, Haarnoja e
 From top to bottom: settings, losses, critics, a prediction of arms in motion that critics may observe, and
 `TQC`, which joins them.
 
-`TQC` is usable alone, on transitions of any environment with actions in [-1, 1]:
-
-    agent = TQC(obs_size, action_size, TQCConfig(gamma=0.98))
-    state = agent.init(key)
-    action = agent.act(state, obs, key)                                # explores
-    state, metrics = jax.jit(agent.update)(state, Transition(obs, action, reward, next_obs, terminated), key)
-    action = agent.mode(agent.policy(state), obs)                      # does not explore
-
-`train.epoch.replay` has a replay for it: `create`, `add` and `sample`. Nothing here is jitted: wrap the
-outermost function, such as a scan of updates, and donate the state. `train.epoch.replay_epoch` does so.
+`TQC` is usable alone, on transitions of any environment with actions in [-1, 1], see docs/extend.md. Nothing
+here is jitted: wrap the outermost function, such as a scan of updates, and donate the state.
 
 Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K kept target quantiles.
 """

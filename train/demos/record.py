@@ -17,7 +17,6 @@ from typing import Annotated, NamedTuple
 import jax
 import numpy as np
 import tyro
-from rich.console import Console
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
@@ -175,6 +174,7 @@ class Record(ArmOptions):
 
     def __call__(self) -> int:
         console = start()
+        say = partial(console.print, soft_wrap=True)
         check_file("--out", self.out)
         if self.out.exists():
             raise InputError(f"--out: got {self.out}, which is there already, expected a new file")
@@ -186,14 +186,14 @@ class Record(ArmOptions):
         expert = Expert(spec, s2r, pipe)
         plan = expert.plan(waypoints)
         # Record, and report the poses and errors.
-        recorder = WaypointRecorder(arm, expert, partial(_print, console), partial(save_log, self.out))
+        recorder = WaypointRecorder(arm, expert, say, partial(save_log, self.out))
         result = recorder.record(waypoints, plan)
         if len(result.log) and result.ending.status != NOT_WRITTEN:
-            _print(console, f"demonstrations: {self.out}, {len(result.log)} poses")
+            say(f"demonstrations: {self.out}, {len(result.log)} poses")
             if np.isfinite(result.off_m).any():
-                _print(console, f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
+                say(f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
         if result.ending.cause:
-            _print(console, f"ended early: {result.ending.cause}")
+            say(f"ended early: {result.ending.cause}")
         return result.ending.status or (DONE if len(result.log) else MISSED)
 
 
@@ -209,12 +209,8 @@ class Check(ArmOptions):
         spec = self.read_arm(console).spec
         log, findings = read_demonstrations(self.file, spec)
         for text in (*_summary(log, spec), *map(str, findings)):
-            _print(console, text)
+            console.print(text, soft_wrap=True)
         return 0
-
-
-def _print(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True)
 
 
 def _summary(log: Log, spec: ArmSpec) -> list[str]:

@@ -134,7 +134,8 @@ def evaluate(
         )
     # Evaluate under them.
     spec = opened.spec.replace(mass={"payload_kg": opened.spec.mass.payload_kg + 1e-3 * payload})
-    summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.arm.s2r), n_actions)(policy)
+    env = ReachEnv(spec, config, opened.arm.s2r)
+    summary, *_ = dataclasses.replace(task.evaluate, env=env, n_actions=n_actions)(policy)
     _table(f"{task.evaluate.title}, {how}", summary, console)
     file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())

@@ -9,8 +9,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +25,6 @@ from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.sensing.pose import pose_error
-from train.demos.demonstrations import Demonstrations
 
 N_GOALS = 2_000
 NEAR_MM = 5.0  # tip error of an arm that has arrived, in motion
@@ -97,26 +95,38 @@ class Summary(Figures):
     near_median_s: float | None = figure("  after, in the median of all", "s", 2, default=None)
 
 
-class Evaluator:
-    """Evaluate policies of one learner on one arm without randomisation; compiled once.
+@dataclass(eq=False)
+class _Evaluator:
+    """Evaluate policies of one learner on one arm without randomisation; compiled once."""
 
-    Every goal gets `n_actions` of the deterministic policy, and the state after the last counts. Each of many
-    arms goes from goal to goal of its part of the workspace. One goes twice around the circle, and its second
-    lap counts. `shift_limit` (6,) [mm, deg] limits how goals are corrected, see `reach`.
+    env: ReachEnv
+    learner: Any
+    n_actions: int = N_ACTIONS  # actions of the deterministic policy towards each goal; the last state counts
+    shift_limit: np.ndarray = field(default_factory=lambda: UNCORRECTED)  # (6,) [mm, deg], see `reach`
+
+    def __post_init__(self) -> None:
+        self.env = nominal(self.env)
+
+    def _from_start(self, policy: Any, path: Array, key: Array) -> Reached:
+        """Return the results of one arm, from a random start, along a path (n, 6) of goals."""
+        start = self.env.reset(key)
+        return follow(self.env, self.learner, policy, path, start, self.n_actions, self.shift_limit)
+
+
+@dataclass(eq=False)
+class Evaluator(_Evaluator):
+    """Evaluate policies over the workspace and on the circle.
+
+    Each of many arms goes from goal to goal of its part of the workspace. One goes twice around the circle,
+    and its second lap counts.
     """
 
-    def __init__(
-        self,
-        env: ReachEnv,
-        learner: Any,
-        n_goals: int = N_GOALS,
-        n_actions: int = N_ACTIONS,
-        shift_limit: np.ndarray = UNCORRECTED,
-    ):
-        self.env, self.learner, self.n_goals = nominal(env), learner, n_goals
-        self.circle = np.asarray(circle_poses(env.spec))
-        go = follower(self.env, learner, n_actions, shift_limit)
-        self._follow = xla.jit(jax.vmap(go, in_axes=(None, 0, 0)))
+    n_goals: int = N_GOALS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.circle = np.asarray(circle_poses(self.env.spec))
+        self._follow = xla.jit(jax.vmap(self._from_start, in_axes=(None, 0, 0)))
 
     @property
     def title(self) -> str:
@@ -132,12 +142,6 @@ class Evaluator:
         """Both sets of held-out poses (2 n_goals, 6) [mm, deg], drawn on first use."""
         sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
         return np.concatenate([poses.pose for poses in sets])
-
-    def on(
-        self, env: ReachEnv, n_actions: int = N_ACTIONS, shift_limit: np.ndarray = UNCORRECTED
-    ) -> Evaluator:
-        """Return the same evaluation on another environment."""
-        return Evaluator(env, self.learner, self.n_goals, n_actions, shift_limit)
 
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
         """Return figures, and the results on the first set and on the circle as NumPy arrays."""
@@ -252,15 +256,6 @@ def follow(
     return jax.lax.scan(go_on, state, path)[1]
 
 
-def follower(
-    env: ReachEnv, learner: Any, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
-) -> Callable[[Any, Array, Array], Reached]:
-    """Return the function of policy, path and key that follows a path from a random start."""
-    return lambda policy, path, key: follow(
-        env, learner, policy, path, env.reset(key), n_actions, shift_limit
-    )
-
-
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:
     """Return the figures of results on both sets of goals and on the circle."""
     error, around, at_even = workspace.tip_error_mm, circle.tip_error_mm, even.tip_error_mm
@@ -319,33 +314,20 @@ class PositionSummary(Figures):
     unsettled: int = figure("arms that did not settle", "")
 
 
-class PositionEvaluator:
-    """Evaluate policies on m demonstrated positions, one after another; compiled once.
+@dataclass(eq=False)
+class PositionEvaluator(_Evaluator):
+    """Evaluate policies on demonstrated positions, one after another.
 
-    An action leads to the same pose from every start, so one arm without randomisation goes from position to
-    position. Its second pass counts. `first` (m,) bool marks the positions that are goals of the first
-    stage. Goals are corrected as in `Evaluator`.
+    An action leads to the same pose from every start, so one arm goes from position to position. Its second
+    pass counts.
     """
 
-    def __init__(
-        self,
-        env: ReachEnv,
-        learner: Any,
-        demonstrations: Demonstrations,
-        first: np.ndarray,
-        n_actions: int = N_ACTIONS,
-        shift_limit: np.ndarray = UNCORRECTED,
-    ):
-        self.learner, self.demonstrations, self.first = learner, demonstrations, first
-        self.positions = np.asarray(demonstrations.positions, np.float32)  # (m, 6)
-        self.env = nominal(env)
-        self._go = xla.jit(follower(self.env, learner, n_actions, shift_limit))
+    positions: np.ndarray = field(kw_only=True)  # (m, 6) [mm, deg], float32
+    first: np.ndarray = field(kw_only=True)  # (m,) bool: goals of the first stage
 
-    def on(
-        self, env: ReachEnv, n_actions: int = N_ACTIONS, shift_limit: np.ndarray = UNCORRECTED
-    ) -> PositionEvaluator:
-        """Return the same evaluation on another environment."""
-        return PositionEvaluator(env, self.learner, self.demonstrations, self.first, n_actions, shift_limit)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._go = xla.jit(self._from_start)
 
     @property
     def title(self) -> str:

@@ -158,7 +158,6 @@ class Run:
         Raises:
             InputError: the folder already holds a run, or cannot be made.
         """
-        # Refuse a folder with a run.
         if (path / CONFIG_FILE).exists():
             raise InputError(
                 f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"

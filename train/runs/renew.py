@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,6 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
         console.print(
             f"tip error in simulation, {name}: {old_mm:.2f} mm on the arm of the training, "
             f"{new[name]:.2f} mm on the later one",
-            highlight=False,
         )
     console.print(f"besides, simulation is about {models_mm:.2f} mm off the arm")
     if all(np.hypot(new[name], models_mm) <= ENOUGH * np.hypot(old[name], models_mm) for name in old):
@@ -79,6 +79,6 @@ def _errors_mm(run: Run) -> dict[str, float]:
     """Return errors of a policy in simulation, with corrected goals at rest."""
     evaluate = runs.task_of_run(run).evaluate
     if not run.config.env.in_motion:  # the loop corrects the last references of policies of motion instead
-        evaluate = evaluate.on(evaluate.env, shift_limit=SHIFT_LIMIT)
+        evaluate = dataclasses.replace(evaluate, shift_limit=SHIFT_LIMIT)
     figures = evaluate(run.policy())[0].to_dict()
     return {name: figures[key] for name, key in ERRORS.items() if key in figures}

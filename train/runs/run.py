@@ -49,7 +49,8 @@ def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations |
     if demonstrations is None:
         job = Job(epoch, fresh_poses(config, env))
         return Task(job, Evaluator(env, epoch.learner), lambda state, k: state)
-    evaluate = PositionEvaluator(env, epoch.learner, demonstrations, epoch.goals.of_stage(0))
+    positions, first = demonstrations.positions, epoch.goals.of_stage(0)
+    evaluate = PositionEvaluator(env, epoch.learner, positions=positions, first=first)
 
     def prepare(state: State, k: int) -> State:
         errors_mm = lambda: evaluate(epoch.learner.policy(state.learner))[0].error_mm  # noqa: E731

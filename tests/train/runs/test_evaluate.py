@@ -82,7 +82,7 @@ def evaluator(short_env):
         return after, result._replace(near_s=after.pipeline_state.n_steps - state.pipeline_state.n_steps)
 
     goals = short_env.pool.pose[:64]
-    evaluator = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals)).on(short_env, 2)
+    evaluator = Evaluator(short_env, Scripted(short_env, goals), n_actions=2, n_goals=len(goals))
     evaluator.goals = jnp.concatenate([goals, goals])  # both sets
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluate, "reach", counted)
@@ -187,22 +187,12 @@ def perfect(short_env, shown):
     return Perfect()
 
 
-@pytest.fixture
-def at_positions(perfect, shown):
-    """An environment -> its evaluation, half of the positions in the first stage."""
-
-    def make(env, n_actions=4):
-        first = np.arange(len(shown.positions)) % 2 == 0
-        return PositionEvaluator(env, perfect, shown, first, n_actions)
-
-    return make
-
-
 @pytest.mark.parametrize("pipe_mm", [None, 130.0], ids=["open", "narrower than the arm"])
-def test_positions_are_evaluated_with_body_and_pressures(short_env, at_positions, shown, pipe_mm):
+def test_positions_are_evaluated_with_body_and_pressures(short_env, perfect, shown, pipe_mm):
     n = len(shown.positions)
     piped = ReachEnv(short_env.spec, dataclasses.replace(short_env.config, pipe_diameter_mm=pipe_mm))
-    figures, at = at_positions(short_env).on(piped, 4)(0.0)
+    positions, first = np.asarray(shown.positions), np.arange(n) % 2 == 0
+    figures, at = PositionEvaluator(piped, perfect, positions=positions, first=first)(0.0)
     assert figures.reached_share == 1.0 and figures.max_mm < 0.05 and len(figures.error_mm) == n
     assert (
         figures.success_share == (pipe_mm is None) and figures.outside_positions == (pipe_mm is not None) * n
