@@ -30,7 +30,8 @@ from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from train.config import TrainConfig, override
 from train.epoch.job import Epoch, Job, State
-from train.options import ReachOptions, start
+from train.options import start
+from train.runs.command import ReachOptions
 from train.runs.evaluate import Summary
 from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
 from train.runs.run import Interrupted, free_path, fresh_poses, task_of, train_together

@@ -10,8 +10,8 @@ from mjx_softarm._support.errors import InputError
 from train.agent.analytic import AnalyticConfig
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig, from_dict, override, to_dict
-from train.options import ReachOptions
 from train.presets import GPU_SIZES, IMITATION_PRESETS, PRESETS
+from train.runs.command import ReachOptions
 
 
 def test_overrides_reach_every_level_and_leave_the_preset_alone():

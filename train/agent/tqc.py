@@ -289,8 +289,12 @@ class TQCState(NamedTuple):
 
 
 # Fields of the state by the names of the parts that another run may begin with, beside the policy.
-_PARTS = {"actor": "actor_params", "critics": "critic_params", "targets": "target_params"}
-_PARTS |= {"log_alpha": "log_alpha"}
+_PARTS = {
+    "actor": "actor_params",
+    "critics": "critic_params",
+    "targets": "target_params",
+    "log_alpha": "log_alpha",
+}
 
 
 class TQC:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self, cast
+from typing import Annotated, Any, Literal, Self, cast
 
 import tyro
 from rich.console import Console
@@ -19,13 +20,56 @@ from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.config import ENGINES
 from train.agent.imitation import ImitationConfig
-from train.config import TrainConfig
+from train.config import LEARNERS, TrainConfig, name_of
 from train.demos.demonstrations import from_log, read_demonstrations
-from train.options import NewRunOptions, ReachOptions, named, start
-from train.presets import IMITATION_PRESETS
+from train.options import ArmOptions, start
+from train.presets import IMITATION_PRESETS, PRESETS, preset_of
 from train.runs import run as runs
 from train.runs.evaluate import N_ACTIONS
 from train.runs.folder import Run, sole_trainer
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewRunOptions(ArmOptions):
+    """Options of a command that makes a folder, or continues one."""
+
+    out: cli.MaybePath = None
+    """new folder; None: a name in runs/ after the preset"""
+    resume: cli.MaybePath = None
+    """folder to continue; its own settings hold"""
+
+    def check_resume_alone(self) -> None:
+        """Raise InputError for settings beside `--resume`: those that differ from the command's own."""
+        command: Any = self  # each has `config` and `default`
+        new = command.default([])
+        names = _differing(command, new, ("resume", "config")) + _differing(command.config, new.config)
+        if names:
+            given = ", ".join(f"--{name}" for name in dict.fromkeys(names))
+            raise InputError(f"--resume {self.resume}: got {given} too, expected none: its own settings hold")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReachOptions(NewRunOptions):
+    """Options of a command that trains policies which reach poses of the workspace."""
+
+    preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
+    """settings to begin with; the defaults below are this preset's"""
+    size: Literal["cpu", "gpu"] = "cpu"
+    """machine that the preset's numbers of arms, steps and transitions suit; gpu: of analytic and motion"""
+    learner: Annotated[str, cli.one_of(n for n, c in LEARNERS.items() if not c.FROM_DEMONSTRATIONS)] = "tqc"
+    """learner; where it is not the preset's, it begins with its own defaults"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+
+    @classmethod
+    def default(cls, arguments: Sequence[str]) -> Self:
+        preset = _named(arguments, "--preset", PRESETS, "quick")
+        size: Any = _named(arguments, "--size", ("cpu", "gpu"), "cpu")
+        config = preset_of(preset, size)
+        preset_learner = name_of(config.learner)
+        learner = _named(arguments, "--learner", LEARNERS, preset_learner)
+        if learner != preset_learner:
+            config = dataclasses.replace(config, learner=LEARNERS[learner]())
+        return cls(preset=preset, size=size, learner=learner, config=config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +107,7 @@ class Imitate(NewRunOptions):
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
-        preset = named(arguments, "--preset", IMITATION_PRESETS, "pipe")
+        preset = _named(arguments, "--preset", IMITATION_PRESETS, "pipe")
         return cls(preset=preset, config=IMITATION_PRESETS[preset])
 
     def __call__(self) -> int:
@@ -85,6 +129,18 @@ class Imitate(NewRunOptions):
         config = dataclasses.replace(self.config, learner=learner)
         donors = {"agent": self.agent, "reward": self.reward}
         return _begin("imitate", self, config, donors, console, self.file)
+
+
+def _differing(one: Any, other: Any, ignored: Sequence[str] = ()) -> list[str]:
+    names = [item.name for item in dataclasses.fields(one)]
+    return [name for name in names if name not in ignored and getattr(one, name) != getattr(other, name)]
+
+
+def _named(arguments: Sequence[str], option: str, names: Iterable[str], default: str) -> str:
+    """Return the name that an option has among the words of a command line, or the default without one."""
+    words = [part for word in arguments for part in word.split("=", 1)]
+    name = dict(itertools.pairwise(words)).get(option, default)
+    return name if name in names else default  # an unknown one is refused as all options are read
 
 
 def evaluate(
