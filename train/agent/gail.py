@@ -35,9 +35,8 @@ class GailConfig:
     hidden: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     learning_rate: Amount = 3e-4  # learning rate (Adam)
     gradient_penalty: Amount = 20.0  # weight of the gradient penalty, the paper's lambda
-    penalty_on: Literal["logit", "probability"] = (
-        "logit"  # output whose gradient is penalised; the paper's is the probability
-    )
+    penalty_on: Literal["logit", "probability"] = "logit"
+    """output whose gradient is penalised; the paper's is the probability"""
     input_scale: Positive = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:
