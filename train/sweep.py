@@ -12,6 +12,7 @@ import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -83,13 +84,6 @@ def variable(config: TrainConfig) -> tuple[str, ...]:
     return tuple(f"{group}.{name}" for group, names in numbers.items() for name in names)
 
 
-def setting(config: Any, path: str) -> Any:
-    """Return the value of a setting such as `learner.gamma`."""
-    for name in path.split("."):
-        config = getattr(config, name)
-    return config
-
-
 def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -> dict[str, TrainConfig]:
     """Return the members of a sweep, each seed with each combination of the varied numbers.
 
@@ -119,8 +113,9 @@ def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -
         changes = [f"{path}={text}" for path, text in zip(values, combination, strict=True)]
         member = override(config, [f"seed={seed}", *changes])
         for path in values:
-            if not isinstance(setting(member, path), float):
-                raise InputError(f"--vary {path}: got {setting(member, path)}, expected numbers")
+            value = attrgetter(path)(member)
+            if not isinstance(value, float):
+                raise InputError(f"--vary {path}: got {value}, expected numbers")
         members["-".join([f"seed{seed}", *changes])] = member
     return members
 
@@ -135,7 +130,7 @@ def open_members(path: Path) -> list[Run]:
 
 def differing(runs: Sequence[Run]) -> dict[str, list[float]]:
     """Return the numbers in which runs differ besides their seeds, with the value of each run."""
-    values = {name: [setting(run.config, name) for run in runs] for name in variable(runs[0].config)}
+    values = {name: [attrgetter(name)(run.config) for run in runs] for name in variable(runs[0].config)}
     return {name: numbers for name, numbers in values.items() if len(set(numbers)) > 1}
 
 

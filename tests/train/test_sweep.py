@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+from operator import attrgetter
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from train.runs import plots
 from train.runs.evaluate import Summary
 from train.runs.folder import Checkpoints, Run
 from train.runs.run import Task
-from train.sweep import RESULTS_FILE, MembersEpoch, members_of, open_members, report, setting, variable
+from train.sweep import RESULTS_FILE, MembersEpoch, members_of, open_members, report, variable
 
 CONFIG = dataclasses.replace(
     small.CONFIG,
@@ -36,7 +37,7 @@ CONFIG = dataclasses.replace(
 )
 VARIABLE = variable(CONFIG)
 # Each setting that may be varied, at another value; 0.2 for zero.
-OTHER = [f"{name}={0.5 * (setting(CONFIG, name) or 0.4)}" for name in VARIABLE]
+OTHER = [f"{name}={0.5 * (attrgetter(name)(CONFIG) or 0.4)}" for name in VARIABLE]
 N_EPOCHS = 5
 AT_REST = [field.name for field in dataclasses.fields(Summary) if field.default is dataclasses.MISSING]
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -60,7 +61,7 @@ def job(env):
 @pytest.fixture(scope="module")
 def given(members):
     """Keys and numbers of the members."""
-    numbers = {name: jnp.asarray([setting(c, name) for c in members.values()]) for name in VARIABLE}
+    numbers = {name: jnp.asarray([attrgetter(name)(c) for c in members.values()]) for name in VARIABLE}
     return jnp.stack([jax.random.PRNGKey(config.seed) for config in members.values()]), numbers
 
 
