@@ -219,16 +219,8 @@ def _summary(log: Log, spec: ArmSpec) -> list[str]:
     sequences = ", ".join(f"{k} with {count}" for k, count in zip(ids, counts, strict=True))
     low, high = demos.positions.min(axis=0), demos.positions.max(axis=0)
     ranges = ", ".join(f"{axis} {low[k]:.0f} to {high[k]:.0f}" for k, axis in enumerate("xyz"))
-    lines = [
+    return [
         f"poses: {len(log)}, tip [mm]: {ranges}",
         f"sequences: {len(ids)}: {sequences}",
         f"actions: {demos.actions.min():.3f} to {demos.actions.max():.3f} of -1 to 1",
     ]
-    if len(log) > 1:
-        apart_mm = np.linalg.norm(demos.positions[:, None, :3] - demos.positions[:, :3], axis=-1)
-        apart_mm[np.tril_indices(len(log))] = np.inf
-        one, other = np.unravel_index(np.argmin(apart_mm), apart_mm.shape)
-        lines.append(
-            f"closest: {apart_mm[one, other]:.1f} mm apart, lines {log.row[one]} and {log.row[other]}"
-        )
-    return lines

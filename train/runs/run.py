@@ -220,22 +220,20 @@ def timed_epoch(job: Any, state: State, learner: LearnerConfig, epoch: int) -> t
     start = time.perf_counter()
     state, metrics = job.epoch(state)
     metrics = jax.device_get(metrics)
-    seconds, before = time.perf_counter() - start, counts(learner, epoch)
-    done = {name: n - before[name] for name, n in counts(learner, epoch + 1).items()}
-    return state, metrics | {f"speed/{name}_per_s": n / seconds for name, n in done.items()}
-
-
-def counts(learner: LearnerConfig, epoch: int) -> dict[str, int]:
-    """Return the numbers of env steps and updates by the end of an epoch, by their names in metrics."""
-    return {"env_steps": learner.n_env_steps(epoch), "updates": learner.n_updates(epoch)}
+    seconds = time.perf_counter() - start
+    n_updates = learner.n_updates(epoch + 1) - learner.n_updates(epoch)
+    metrics["speed/env_steps_per_s"] = learner.n_env_steps(1) / seconds
+    metrics["speed/updates_per_s"] = n_updates / seconds
+    return state, metrics
 
 
 def record(run: Run, board: SummaryWriter, epoch: int, row: dict[str, float]) -> None:
     """Add a row to the run's metrics and to TensorBoard's."""
-    done = counts(run.config.learner, epoch)
-    run.log({"epoch": epoch, **done, **row})
+    learner = run.config.learner
+    env_steps = learner.n_env_steps(epoch)
+    run.log({"epoch": epoch, "env_steps": env_steps, "updates": learner.n_updates(epoch), **row})
     for name, value in row.items():
-        board.add_scalar(name, np.float32(value), done["env_steps"])
+        board.add_scalar(name, np.float32(value), env_steps)
 
 
 def _line(rows: Sequence[dict[str, float]], task: Task) -> str:
