@@ -19,8 +19,8 @@ COMMANDS = {
     "evaluate": "train.runs.command:evaluate",
     "export": "train.runs.export:export",
     "sweep": "train.sweep:Sweep",
-    "demos record": "train.demos.command:Record",
-    "demos check": "train.demos.command:Check",
+    "demos record": "train.demos.record:Record",
+    "demos check": "train.demos.record:Check",
 }
 
 

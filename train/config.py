@@ -12,9 +12,17 @@ from typing import Any, Self
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import Count, Number, check_ranges
 from mjx_softarm.env import EnvConfig
+from train.agent.analytic import AnalyticConfig
+from train.agent.imitation import ImitationConfig
 from train.agent.learner import LearnerConfig
-from train.agent.registry import LEARNERS, name_of
 from train.agent.tqc import TQCConfig
+
+# Configs of the learners, by the names that the command line and a run's JSON know.
+LEARNERS: dict[str, type[LearnerConfig]] = {
+    "tqc": TQCConfig,
+    "analytic": AnalyticConfig,
+    "imitation": ImitationConfig,
+}
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,11 @@ def override(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:
     return _read(TrainConfig, data, "")
 
 
+def name_of(learner: LearnerConfig) -> str:
+    """Return the name of the learner that a config is for."""
+    return next(name for name, kind in LEARNERS.items() if type(learner) is kind)
+
+
 def to_dict(config: TrainConfig) -> dict[str, Any]:
     """Return nested dictionaries for JSON, the learner's with its name; tuples become lists."""
     data = dataclasses.asdict(config)
@@ -105,7 +118,7 @@ def _read(kind: Any, value: Any, path: str) -> Any:
         name, value = value.get("name"), {key: item for key, item in value.items() if key != "name"}
         if name not in LEARNERS:
             raise InputError(f"{path}.name: got {name!r}, expected one of {', '.join(LEARNERS)}")
-        kind = LEARNERS[name].config
+        kind = LEARNERS[name]
     # A group of settings.
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         hints = typing.get_type_hints(kind)

@@ -12,6 +12,7 @@ import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -28,14 +29,13 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
-from train.agent.registry import epoch_of
 from train.config import TrainConfig, override
 from train.epoch.job import Epoch, Job, State
-from train.options import ReachOptions, start
+from train.options import start
+from train.runs.command import ReachOptions
 from train.runs.evaluate import Summary
 from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
-from train.runs.run import Interrupted, free_path, train_together
-from train.runs.task import fresh_poses, task_of
+from train.runs.run import Interrupted, free_path, fresh_poses, task_of, train_together
 
 RESULTS_FILE = "results.json"
 
@@ -53,7 +53,7 @@ class Sweep(ReachOptions):
         console = start()
         # The members, of a folder or of these settings.
         if self.resume:
-            self.check_resume_alone(self.default([]))
+            self.check_resume_alone()
             path, runs = self.resume, open_members(self.resume)
             for run in (run for run in runs if run.checkpoints.latest is None):
                 run.check_begins_anew()
@@ -64,16 +64,16 @@ class Sweep(ReachOptions):
                 raise InputError(f"--out: got {path}, which exists, expected a new folder, or --resume")
             arm, preset = self.read_arm(console), self.preset
             runs = [Run.create(path / name, members[name], arm, preset=preset) for name in sorted(members)]
-        console.print(f"sweep: {path}, {len(runs)} members", highlight=False)
+        console.print(f"sweep: {path}, {len(runs)} members")
         # Train all of them, and report.
         try:
             with sole_trainer(path):
                 train(path, runs, console)
         except Interrupted as stop:
-            console.print(str(stop), highlight=False)
+            console.print(str(stop))
             return cli.INTERRUPTED
         console.print(report(path, runs))
-        console.print(f"results: {path / RESULTS_FILE}", highlight=False, soft_wrap=True)
+        console.print(f"results: {path / RESULTS_FILE}", soft_wrap=True)
         return 0
 
 
@@ -82,13 +82,6 @@ def variable(config: TrainConfig) -> tuple[str, ...]:
     rewards = (item.name for item in dataclasses.fields(RewardConfig) if not isinstance(item.default, tuple))
     numbers = {"learner": config.learner.VARIABLE, "env.reward": rewards}
     return tuple(f"{group}.{name}" for group, names in numbers.items() for name in names)
-
-
-def setting(config: Any, path: str) -> Any:
-    """Return the value of a setting such as `learner.gamma`."""
-    for name in path.split("."):
-        config = getattr(config, name)
-    return config
 
 
 def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -> dict[str, TrainConfig]:
@@ -120,8 +113,9 @@ def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -
         changes = [f"{path}={text}" for path, text in zip(values, combination, strict=True)]
         member = override(config, [f"seed={seed}", *changes])
         for path in values:
-            if not isinstance(setting(member, path), float):
-                raise InputError(f"--vary {path}: got {setting(member, path)}, expected numbers")
+            value = attrgetter(path)(member)
+            if not isinstance(value, float):
+                raise InputError(f"--vary {path}: got {value}, expected numbers")
         members["-".join([f"seed{seed}", *changes])] = member
     return members
 
@@ -136,7 +130,7 @@ def open_members(path: Path) -> list[Run]:
 
 def differing(runs: Sequence[Run]) -> dict[str, list[float]]:
     """Return the numbers in which runs differ besides their seeds, with the value of each run."""
-    values = {name: [setting(run.config, name) for run in runs] for name in variable(runs[0].config)}
+    values = {name: [attrgetter(name)(run.config) for run in runs] for name in variable(runs[0].config)}
     return {name: numbers for name, numbers in values.items() if len(set(numbers)) > 1}
 
 
@@ -159,7 +153,7 @@ class MembersEpoch:
     """`Epoch` of all members, each with its own config, which holds traced numbers."""
 
     def __init__(self, config: TrainConfig, env: ReachEnv):
-        one = epoch_of(config.learner, env)
+        one = config.learner.make_epoch(env)
         self.config, self.env, self.kind, self.learner = config, env, one.kind, one.learner
 
     def first(self, key: tuple[Array, dict[str, Array]]) -> MembersState:
@@ -180,7 +174,7 @@ class MembersEpoch:
         config = self.config
         for path, number in numbers.items():
             config = _with_number(config, path, number)
-        return epoch_of(config.learner, with_config(self.env, config))
+        return config.learner.make_epoch(with_config(self.env, config))
 
 
 def _with_number(config: Any, path: str, number: Array) -> Any:

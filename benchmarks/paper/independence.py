@@ -36,12 +36,11 @@ from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
-from train.agent.registry import epoch_of
 from train.config import override
 from train.presets import PRESETS
 from train.runs import evaluate
 from train.runs.evaluate import Reached, paths_of, start_keys, towards
-from train.runs.task import task_of
+from train.runs.run import task_of
 
 LOADS_G = (0, 250, 500, 1000)
 FIGURES = ("median_mm", "mean_mm", "p95_mm", "saturated_percent")
@@ -123,13 +122,13 @@ def policy_rows(settings: Settings, name: str, seed: int) -> list[dict[str, Any]
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     for _ in range(config.learner.n_epochs):
         state, _ = job.epoch(state)
-    policy = jax.device_get(job.policy(state))
+    policy = jax.device_get(job.learner.policy(state.learner))
     # Follow paths of goals.
     loaded = Randomisation(payload_max_kg=LARGEST_KG)
     env_config = EnvConfig(engine="chain", observation=config.env.observation, randomisation=loaded)
     env = kind.env(spec, env_config)
     paths = paths_of(jnp.concatenate(goals_of(env, settings.n_goals)))
-    one = functools.partial(follow, env, epoch_of(config.learner, env).learner)
+    one = functools.partial(follow, env, config.learner.make_epoch(env).learner)
     follow_all = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
     rows = []
     for load_g in LOADS_G:

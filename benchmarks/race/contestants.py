@@ -78,7 +78,7 @@ def ours(name: str, seed: int) -> Contestant:
 
     from mjx_softarm.env import ReachEnv
     from train.presets import PRESETS
-    from train.runs.task import task_of
+    from train.runs.run import task_of
 
     # The preset's job; its first state is made while its epoch compiles.
     config = dataclasses.replace(PRESETS[name.removeprefix("ours-")], seed=seed)
@@ -97,7 +97,7 @@ def ours(name: str, seed: int) -> Contestant:
 
     return Contestant(
         train,
-        policy=lambda obs: np.asarray(act(job.policy(state), obs)),
+        policy=lambda obs: np.asarray(act(job.learner.policy(state.learner), obs)),
         done=done,
         limit=config.learner.total_env_steps,
     )

@@ -32,7 +32,6 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
-from train.agent.registry import epoch_of
 from train.agent.tqc import TQCConfig
 from train.epoch.job import Job
 from train.presets import PRESETS
@@ -128,13 +127,13 @@ def measure_costs() -> dict[str, float]:
     settings: Any = {"n_arms": n_arms, "vector_steps_per_epoch": n_steps, "batch_size": SIZES["batch_size"]}
     settings |= {"updates_per_env_step": SIZES["n_updates"] / n_steps / n_arms, "warmup_env_steps": 0}
     config = dataclasses.replace(cast(TQCConfig, PRESETS["quick"].learner), **settings)
-    job = Job(epoch_of(config, env))
+    job = Job(config.make_epoch(env))
     states = [job.init(jax.random.PRNGKey(0))]
 
     def compile_epoch() -> None:
         nonlocal job
         jax.clear_caches()
-        job = Job(epoch_of(config, env))
+        job = Job(config.make_epoch(env))
         job.compile_epoch()
 
     # Compile its epoch, and prepare the other work, whose first calls do not count.

@@ -27,7 +27,7 @@ from mjx_softarm.env.gym import EPISODE_LENGTH
 from mjx_softarm.env.vector import VectorEnv
 from train.config import TrainConfig
 from train.presets import PRESETS
-from train.runs.task import task_of
+from train.runs.run import task_of
 
 N_STEPS = {"quasistatic": 8, "dynamic": 1}  # environment steps of each arm in a call, of up to `N_FEW` arms
 N_FEW = 1024  # more arms take one step in a call

@@ -18,7 +18,7 @@ from calib import demo
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli
 from mjx_softarm.policy.file import SHIPPED, load_policy
-from train.runs import estimator
+from train.runs import arm_model
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [
@@ -189,9 +189,9 @@ def journey(tmp_path, monkeypatch):
     for module, name, value in (
         (demo, "N_POSES", 80),
         (demo, "N_STEPS", 3),
-        (estimator, "SCHEDULE", estimator.SCHEDULE._replace(n_updates=200)),
-        (estimator, "N_TRAINING", 1024),
-        (estimator, "N_JUDGING", 256),
+        (arm_model, "SCHEDULE", arm_model.SCHEDULE._replace(n_updates=200)),
+        (arm_model, "N_TRAINING", 1024),
+        (arm_model, "N_JUDGING", 256),
     ):
         monkeypatch.setattr(module, name, value)
     monkeypatch.chdir(tmp_path)

@@ -138,20 +138,19 @@ def test_resume_says_that_a_run_without_a_checkpoint_begins_anew(tmp_path, monke
     monkeypatch.setattr("train.runs.command._train", lambda *_: 0)
     assert main(["reach", "--resume", str(tmp_path)]) == 0
     assert f"{tmp_path}: no checkpoint yet, the run begins anew" in capsys.readouterr().out
-    for epoch in range(1, 21):
+    for epoch in range(1, CONFIG.learner.n_epochs + 1):
         run.log({"epoch": epoch})
+    run.check_begins_anew()  # it may have died before the checkpoint of the last epoch
+    run.log({"epoch": epoch + 1})
     assert main(["reach", "--resume", str(tmp_path)]) == 2
-    assert "got no checkpoint of a run with 20 epochs" in capsys.readouterr().err
+    assert "got no checkpoint of a run with 9 epochs" in capsys.readouterr().err
 
 
 def test_export_reads_the_policy_before_it_distils(tmp_path, monkeypatch, capsys):
-    run = Run.create(tmp_path, CONFIG, CalibratedArm(SHORT))
+    Run.create(tmp_path, CONFIG, CalibratedArm(SHORT))
     monkeypatch.setattr("train.runs.arm_model.arm_model", lambda *_: pytest.fail("distilled"))
     assert main(["export", str(tmp_path)]) == 2
     assert f"{tmp_path}: got no checkpoint, expected one" in capsys.readouterr().err
-    monkeypatch.setattr(Run, "policy", lambda run: {"params": {"other": {}}})
-    assert main(["export", str(tmp_path)]) == 2
-    assert f"{run.path}: actor parameters: got ['other']" in capsys.readouterr().err
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):

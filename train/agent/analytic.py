@@ -41,6 +41,7 @@ from mjx_softarm.env.vector import VectorEnv, choose_arms
 from mjx_softarm.mdp import rewards
 from train.agent.learner import LearnerConfig
 from train.agent.networks import Actor, check_same_shapes, descend, mode, own_buffers, widened
+from train.demos.demonstrations import Demonstrations
 
 Params = Any  # a flax parameter tree
 MAX_GRADIENT_NORM = 1.0  # a longer gradient is shortened to this
@@ -70,6 +71,10 @@ class AnalyticConfig(LearnerConfig):
         engine = "mjx" if env.in_motion else "chain"
         usable = env.engine == engine
         check_settings("env", env, {"engine": (usable, f"{engine!r}, whose gradient this learner takes")})
+
+    def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> GradientEpoch:
+        """Return the epoch of gradient steps."""
+        return GradientEpoch(self, env)
 
 
 class AnalyticState(NamedTuple):
@@ -115,25 +120,15 @@ class Analytic:
         return {"policy": state.mean_actor_params}
 
     def adopt(self, state: AnalyticState, parts: Mapping[str, Params]) -> AnalyticState:
-        """Return the state with another run's policy, of any learner; it may observe less.
-
-        Raises:
-            ValueError: the policy has another size.
-        """
+        """Return the state with another run's policy, of any learner; it may observe less."""
         params = widened(parts["policy"], self.obs_size)
         check_same_shapes("actor", params, state.actor_params)
         return state._replace(actor_params=params, mean_actor_params=own_buffers(params))
 
     def update(self, state: AnalyticState, obs: Array, d_action: Array) -> tuple[AnalyticState, Array]:
-        """Take one gradient step.
+        """Take one gradient step; return the next state and the norm () of the gradient.
 
-        Args:
-            state: state.
-            obs (..., O): observations.
-            d_action (..., A): derivatives of the loss by the policy's actions there.
-
-        Returns:
-            The next state; the norm of the gradient ().
+        `d_action` (..., A) are the derivatives of the loss by the policy's actions at `obs` (..., O).
         """
         _, pull_back = jax.vjp(lambda params: self.mode(params, obs), state.actor_params)
         (gradient,) = pull_back(d_action)
@@ -162,12 +157,7 @@ class _Ahead(NamedTuple):
 
 
 class GradientEpoch:
-    """Epoch of gradient steps, each with one action of all arms.
-
-    Args:
-        config: hyperparameters.
-        env: the arm.
-    """
+    """Epoch of gradient steps, each with one action of all arms."""
 
     kind: xla.Kind = "arm"
 
@@ -184,11 +174,9 @@ class GradientEpoch:
         return GradientState(self.arms.reset(key_arms), self.learner.init(key_actor), key, n_epochs)
 
     def advance(self, state: GradientState) -> tuple[GradientState, dict[str, Array]]:
-        """Take `vector_steps_per_epoch` gradient steps.
+        """Take `vector_steps_per_epoch` gradient steps; return the state, and means over the epoch by name.
 
-        Returns:
-            The next state; means over the epoch by name. `env/unsettled` is the number of arms that did not
-            settle.
+        `env/unsettled` is the number of arms that did not settle.
         """
         state, metrics = jax.lax.scan(self._step, state, None, length=self.config.vector_steps_per_epoch)
         unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms

@@ -27,9 +27,6 @@ from jax import Array
 from mjx_softarm._support.fields import Amount, Positive, check_ranges
 from train.agent.networks import descend
 
-Score = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...)
-Penalised = Literal["logit", "probability"]
-
 
 @dataclass(frozen=True)
 class GailConfig:
@@ -38,7 +35,8 @@ class GailConfig:
     hidden: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     learning_rate: Amount = 3e-4  # learning rate (Adam)
     gradient_penalty: Amount = 20.0  # weight of the gradient penalty, the paper's lambda
-    penalty_on: Penalised = "logit"  # output whose gradient is penalised; the paper's is the probability
+    penalty_on: Literal["logit", "probability"] = "logit"
+    """output whose gradient is penalised; the paper's is the probability"""
     input_scale: Positive = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:
@@ -89,16 +87,10 @@ class Gail:
         agent: tuple[Array, Array],
         key: Array,
     ) -> tuple[DiscriminatorState, dict[str, Array]]:
-        """Take one gradient step.
+        """Take one gradient step; return the next state, and scalar metrics.
 
-        Args:
-            state: state of the discriminator.
-            expert, agent: observations (B, O) and actions (B, A). Row k of both has one goal, so the points
-                between them have this goal, too.
-            key: draws the points between expert and agent, where the gradient is penalised.
-
-        Returns:
-            The next state, and scalar metrics: the loss without penalty, the penalty, the accuracy.
+        `expert` and `agent` are observations (B, O) and actions (B, A). Row k of both has one goal, so the
+        points between them have this goal, too.
         """
         # Points between expert and agent, where the gradient's norm should be 1.
         expert, agent = self._scaled(*expert), self._scaled(*agent)
@@ -134,7 +126,7 @@ def cross_entropy(expert_logits: Array, agent_logits: Array) -> Array:
     return jnp.mean(jax.nn.softplus(-expert_logits)) + jnp.mean(jax.nn.softplus(agent_logits))
 
 
-def gradient_penalty(score: Score, obs: Array, action: Array) -> Array:
+def gradient_penalty(score: Callable[[Array, Array], Array], obs: Array, action: Array) -> Array:
     """Return the mean of (|grad score| - 1)^2 over points (B, O), (B, A), with the gradient by both.
 
     Where the gradient vanishes, the derivative of its length is taken as zero.

@@ -21,7 +21,7 @@ from jax import Array
 from mjx_softarm._support import draws
 from mjx_softarm._support.errors import check_settings
 from mjx_softarm._support.fields import Number, Share, check_ranges
-from mjx_softarm.mdp import observation as obs
+from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp import rewards
 from train.agent.learner import Experience, Transition
 
@@ -46,28 +46,10 @@ class HindsightConfig:
         check_settings("learner.hindsight", self, {"reached_share": (fits, "at most 1 - near_share")})
 
 
-def relabel(
-    batch: Experience,
-    key: Array,
-    config: HindsightConfig,
-    scale: obs.ObsScale,
-    reward_config: rewards.RewardConfig,
-    *,
-    goal_ends: bool,
-    senses_action: bool,
-) -> Transition:
-    """Return a batch to learn from; some of its transitions have another goal.
+def relabel(batch: Experience, key: Array, config: HindsightConfig, env: ReachEnv) -> Transition:
+    """Return a batch to learn from; some of its B stored transitions have another goal.
 
     With both shares zero, the rewards are the environment's own.
-
-    Args:
-        batch: B stored transitions.
-        key: draws which transitions get another goal, and the goals near a pose.
-        config: shares.
-        scale: of the observations.
-        reward_config: weights of the reward.
-        goal_ends: whether a reached goal ends an episode.
-        senses_action: whether the observation's last entries are the last action.
     """
     # Goals: own, reached, or near the pose reached.
     n = batch.saturated.shape[0]
@@ -89,47 +71,36 @@ def relabel(
 
     # Error, reward and termination recomputed for the goals.
     reward, done, _ = rewards.reward(
-        batch.next_pose, goal, batch.n_steps, saturated, reward_config, batch.clearance_cost
+        batch.next_pose, goal, batch.n_steps, saturated, env.config.reward, batch.clearance_cost
     )
-    before, after = batch.sensed, batch.next_sensed
-    if senses_action and after is not None:
-        after = after.at[:, -action.shape[1] :].set(action)  # the last action, exchanged
+    next_sensed = batch.next_sensed
+    if env.config.observation == "motion" and next_sensed is not None:  # it ends with the last action
+        next_sensed = next_sensed.at[:, -action.shape[1] :].set(action)
     return Transition(
-        obs=_joined(obs.observe(batch.pose, goal, scale, reward_config), before),
+        obs=env.observe(batch.pose, goal, batch.sensed),
         action=action,
         reward=reward,
-        next_obs=_joined(obs.observe(batch.next_pose, goal, scale, reward_config), after),
-        terminated=(done & goal_ends).astype(reward.dtype),
+        next_obs=env.observe(batch.next_pose, goal, next_sensed),
+        terminated=(done & env.config.goal_ends).astype(reward.dtype),
         stored=batch,
         relabelled=reached | near,
     )
 
 
 def later_pose(now: Experience, later: Experience, ahead: Array) -> Array:
-    """Return the poses (B, 6) [mm, deg] that transitions reached some actions later in the same episode.
+    """Return the poses (B, 6) [mm, deg] that B transitions reached some actions later in the same episode.
 
-    Args:
-        now: B transitions.
-        later: B transitions that may be of the same episodes.
-        ahead (B,): number of additions to the replay between the two.
-
-    `later` is of the same episode if it has the same goal and `ahead` more actions. Else the pose is that of
-    the transition itself.
+    `ahead` (B,) counts additions to the replay between `now` and `later`, which is of the same episode if it
+    has the same goal and `ahead` more actions. Else the pose is that of the transition itself.
     """
     same = (later.n_steps == now.n_steps + ahead) & jnp.all(later.goal == now.goal, axis=-1)
     return jnp.where(same[:, None], later.next_pose, now.next_pose)
 
 
-def _joined(observation: Array, sensed: Array | None) -> Array:
-    return observation if sensed is None else jnp.concatenate([observation, sensed], axis=-1)
-
-
 def near_offsets(distance: Array, direction: Array) -> Array:
     """Return offsets (n, 6) [mm, deg]: random directions, log-uniform lengths, and turns.
 
-    Args:
-        distance (n,): uniform draws in [0, 1).
-        direction (n, 6): normal draws.
+    `distance` (n,) are uniform draws in [0, 1), `direction` (n, 6) normal draws.
 
     A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
     tail: some goals are turned further than the arm can turn, as a user's goals may be.

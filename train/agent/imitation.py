@@ -19,7 +19,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from jax import Array
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import xla
-from mjx_softarm._support.errors import check_settings
+from mjx_softarm._support.errors import InputError, check_settings
 from mjx_softarm._support.fields import (
     Amount,
     Count,
@@ -48,7 +48,7 @@ from train.agent.networks import check_same_shapes
 from train.agent.tqc import TQC, TQCConfig, TQCState
 from train.demos.demonstrations import Demonstrations, shown_before
 from train.epoch import replay
-from train.epoch.replay_epoch import ReplayState
+from train.epoch.replay_epoch import ReplayEpoch, ReplayState
 
 ExpertStart = Literal["agent", "shown"]
 EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they are reached
@@ -88,6 +88,8 @@ STAGES_OPTION = PrimitiveConstructorSpec(
 @dataclass(frozen=True)
 class ImitationConfig(TQCConfig):
     """Settings of learning from demonstrations, whose poses are the goals. Raises InputError."""
+
+    FROM_DEMONSTRATIONS: ClassVar[bool] = True
 
     gail: GailConfig = field(default_factory=GailConfig)
     """discriminator"""
@@ -131,6 +133,16 @@ class ImitationConfig(TQCConfig):
             "observation": (env.observation == "pose", "'pose' for demonstrations"),
         }
         check_settings("env", env, required)
+
+    def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> ReplayEpoch:
+        """Return the epoch of the learner, with demonstrated starts and goals.
+
+        Raises:
+            InputError: demonstrations are missing.
+        """
+        if shown is None:
+            raise InputError("learner: got 'imitation' without demonstrations, expected a file of them")
+        return ReplayEpoch(self, env, Imitation(self, env, shown), DemonstratedGoals(self, env, shown))
 
     @property
     def stage_epochs(self) -> tuple[int, ...]:
@@ -220,11 +232,7 @@ class Imitation:
         return parts if state.discriminator is None else parts | {"reward": state.discriminator.params}
 
     def adopt(self, state: ImitationState, parts: Mapping[str, Any]) -> ImitationState:
-        """Return the state with a learned reward, with networks of TQC, or with both.
-
-        Raises:
-            ValueError: a part has another size, or the networks are not those of TQC.
-        """
+        """Return the state with a learned reward, with networks of TQC, or with both."""
         networks = {name: part for name, part in parts.items() if name != "reward"}
         if networks:
             state = state._replace(agent=self.tqc.adopt(state.agent, networks))
@@ -239,12 +247,8 @@ class Imitation:
     ) -> tuple[Array, dict[str, Array]]:
         """Return the rewards (B,) of a batch, and metrics.
 
-        The cost of the body's clearance is charged whatever the weights; the expert keeps clear.
-
-        Args:
-            batch: batch, the expert's rows first.
-            without_reward (B,) bool: rows whose goal the discriminator does not know.
-            discriminator: discriminator that gives the learned reward, if there is one.
+        The cost of the body's clearance is charged whatever the weights; the expert, in the first rows, keeps
+        clear. `without_reward` (B,) bool marks rows whose goal the discriminator does not know.
         """
         assert batch.stored is not None
         cost = batch.stored.clearance_cost.at[: self.n_expert].set(0.0)  # (B,)
@@ -320,43 +324,26 @@ class DemonstratedGoals:
     ) -> ReplayState:
         """Return the state before an epoch: a stage begins, or goals shift to the largest errors.
 
-        Args:
-            state: state of the run.
-            epoch: number of epochs done.
-            errors_mm: returns the tip errors (m,) at the positions.
+        As a stage begins, the state given is used up: its replay is thinned. `epoch` is the number of epochs
+        done; `errors_mm` returns the tip errors (m,) at the positions.
         """
-        every = self.config.rebalance_epochs
-        if every and epoch and epoch % every == 0 and epoch not in self.config.stage_epochs:
-            return self.rebalance(state, epoch, errors_mm())
-        return self.begin_stage(state, epoch)
-
-    def begin_stage(self, state: ReplayState, epoch: int) -> ReplayState:
-        """Return the state with the goals of the stage that begins before an epoch, and a thinner replay.
-
-        It is the state as given where no stage begins; else the state given is used up.
-        """
-        if epoch not in self.config.stage_epochs:
-            return state
-        kept = self.config.stages[self.config.stage_epochs.index(epoch)].kept
-        if kept < 1.0 and epoch:
-            key, key_thin = jax.random.split(state.key)
-            memory = self._thin(state.memory, key_thin, jnp.asarray(kept, jnp.float32))
-            state = state._replace(memory=memory, key=key)
-        return state._replace(goals=jnp.asarray(self.of_stage(epoch), jnp.float32))
-
-    def rebalance(
-        self, state: ReplayState, epoch: int, error_mm: Sequence[float] | np.ndarray
-    ) -> ReplayState:
-        """Return the state with goals shifted to the positions (m,) with the largest errors [mm]."""
-        return state._replace(goals=jnp.asarray(goal_weights(error_mm, self.of_stage(epoch))))
+        every, stages = self.config.rebalance_epochs, self.config.stage_epochs
+        if epoch in stages:
+            kept = self.config.stages[stages.index(epoch)].kept
+            if kept < 1.0 and epoch:
+                key, key_thin = jax.random.split(state.key)
+                memory = self._thin(state.memory, key_thin, jnp.asarray(kept, jnp.float32))
+                state = state._replace(memory=memory, key=key)
+            return state._replace(goals=jnp.asarray(self.of_stage(epoch), jnp.float32))
+        if every and epoch % every == 0:
+            return state._replace(goals=jnp.asarray(goal_weights(errors_mm(), self.of_stage(epoch))))
+        return state
 
 
 def goal_weights(error_mm: Sequence[float] | np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Return how often each position is the goal: a share evenly, the rest in proportion to its error.
+    """Return how often each position is the goal: a share evenly, the rest in proportion to its error (m,).
 
-    Args:
-        error_mm (m,): tip errors at the positions now.
-        goals (m,) bool: positions that are goals at all.
+    `goals` (m,) bool marks the positions that are goals at all.
     """
     error = np.where(goals, error_mm, 0.0)
     by_error = error / error.sum() if error.sum() > 0 else goals / goals.sum()

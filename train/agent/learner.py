@@ -12,7 +12,9 @@ from jax import Array
 
 from mjx_softarm._support.fields import Count, check_ranges
 from mjx_softarm._support.mlp import Activation
-from mjx_softarm.env import EnvConfig
+from mjx_softarm.env import EnvConfig, ReachEnv
+from train.demos.demonstrations import Demonstrations
+from train.epoch.job import Epoch
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,7 @@ class LearnerConfig:
     """Settings of every learner; the config of a learner inherits from it. Raises InputError."""
 
     VARIABLE: ClassVar[tuple[str, ...]] = ()  # names of plain numbers that members of a sweep may differ in
+    FROM_DEMONSTRATIONS: ClassVar[bool] = False  # whether goals are demonstrated poses, as `imitate` has them
 
     hidden: tuple[int, ...] = (256, 256)  # widths of the policy's hidden layers
     activation: Activation = "relu"  # function after each of them
@@ -32,6 +35,10 @@ class LearnerConfig:
 
     def check(self, env: EnvConfig) -> None:
         """Raise InputError where the learner cannot learn in an environment."""
+
+    def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> Epoch:
+        """Return the epoch of the learner; `shown` is for a learner from demonstrations."""
+        raise NotImplementedError
 
     @property
     def n_epochs(self) -> int:

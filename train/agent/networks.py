@@ -19,11 +19,6 @@ class Actor(nn.Module):
 
     Layers are named `hidden_0`, `hidden_1`, ... and `head`, by which export finds them. The head's first
     `action_size` outputs are the mean, the others the log standard deviation.
-
-    Attributes:
-        action_size: number of actions A.
-        hidden: width of each hidden layer.
-        activation: function after each hidden layer.
     """
 
     action_size: int
@@ -79,13 +74,8 @@ def squash(mean: jax.Array, log_std: jax.Array, noise: jax.Array) -> tuple[jax.A
     The Jacobian term uses log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u)), which stays finite and
     differentiable where tanh has already rounded to one.
 
-    Args:
-        mean (..., A): mean before squashing.
-        log_std (..., A): log standard deviation before squashing.
-        noise (..., A): standard normal draw.
-
-    Returns:
-        action (..., A) in (-1, 1), up to rounding at the ends, and log_prob (...): the sum over actions.
+    Mean, log standard deviation and the standard normal noise are (..., A), and so is the action in (-1, 1),
+    up to rounding at the ends; the log-density (...) is the sum over actions.
 
     Source: Haarnoja et al. 2018, arXiv:1812.05905, appendix C (enforcing action bounds).
     """

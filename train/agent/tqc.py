@@ -4,16 +4,8 @@ Kuznetsov et al. 2020, arXiv:2005.04269, on top of soft actor-critic, Haarnoja e
 From top to bottom: settings, losses, critics, a prediction of arms in motion that critics may observe, and
 `TQC`, which joins them.
 
-`TQC` is usable alone, on transitions of any environment with actions in [-1, 1]:
-
-    agent = TQC(obs_size, action_size, TQCConfig(gamma=0.98))
-    state = agent.init(key)
-    action = agent.act(state, obs, key)                                # explores
-    state, metrics = jax.jit(agent.update)(state, Transition(obs, action, reward, next_obs, terminated), key)
-    action = agent.mode(agent.policy(state), obs)                      # does not explore
-
-`train.epoch.replay` has a replay for it: `create`, `add` and `sample`. Nothing here is jitted: wrap the
-outermost function, such as a scan of updates, and donate the state. `train.epoch.replay_epoch` does so.
+`TQC` is usable alone, on transitions of any environment with actions in [-1, 1], see docs/extend.md. Nothing
+here is jitted: wrap the outermost function, such as a scan of updates, and donate the state.
 
 Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K kept target quantiles.
 """
@@ -34,7 +26,7 @@ from jax import Array
 from mjx_softarm._support import draws
 from mjx_softarm._support.errors import check_settings
 from mjx_softarm._support.fields import Amount, Count, Number, Positive, PositiveShare, Share
-from mjx_softarm.env import EnvConfig
+from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
 from train.agent import networks
 from train.agent.hindsight import HindsightConfig
@@ -82,6 +74,10 @@ class TQCConfig(ReplayConfig):
         super().check(env)
         seen = self.n_ahead == 0 or env.observation == "motion"
         check_settings("learner", self, {"n_ahead": (seen, "0 without env.observation 'motion'")})
+
+    def make_learner(self, env: ReachEnv) -> TQC:
+        """Return TQC for the observations and actions of an environment."""
+        return TQC(env.observation_size, env.action_size, self)
 
 
 def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:
@@ -137,11 +133,8 @@ def truncated_targets(
     Args:
         next_quantiles (B, C, M): target critics at the next observation and the actor's action there.
         next_log_prob (B,): log-density of that action.
-        reward (B,): scaled reward.
-        terminated (B,): 1 where no value follows, else 0.
+        reward, terminated (B,): scaled reward; 1 where no value follows, else 0.
         alpha (): temperature.
-        gamma: discount factor.
-        n_drop_per_critic: quantiles dropped per critic.
 
     Source: Kuznetsov et al. 2020, section 3 (target distribution).
     """
@@ -154,10 +147,7 @@ def truncated_targets(
 def actor_loss(log_prob: Array, quantiles: Array, alpha: Array) -> Array:
     """Return the mean () of alpha * log_prob - Q over the actor's actions; Q is the mean of all quantiles.
 
-    Args:
-        log_prob (B,): log-density of the actions.
-        quantiles (B, C, M): critics at those actions.
-        alpha (): temperature.
+    `log_prob` (B,) is the log-density of the actions, `quantiles` (B, C, M) are the critics there.
 
     Source: Kuznetsov et al. 2020, section 3 (policy loss).
     """
@@ -166,11 +156,6 @@ def actor_loss(log_prob: Array, quantiles: Array, alpha: Array) -> Array:
 
 def alpha_loss(log_alpha: Array, log_prob: Array, target_entropy: float) -> Array:
     """Return the mean () of -log_alpha * (log_prob + target_entropy); alpha rises while entropy is too low.
-
-    Args:
-        log_alpha (): log temperature.
-        log_prob (B,): log-density of the actor's actions, a constant here.
-        target_entropy: target entropy [nat].
 
     Source: Haarnoja et al. 2018, arXiv:1812.05905, section 6; log_alpha in place of alpha, as in its code.
     """
@@ -183,18 +168,12 @@ class Critics(nn.Module):
     All critics read the same input, so their first layers are one matrix whose columns are split among them.
     Deeper layers are a matrix per critic. No parameter is shared. On a CPU this is faster than a vmapped
     ensemble, which transposes at every layer.
-
-    Attributes:
-        n_critics: number of critics C.
-        n_quantiles: quantiles per critic M.
-        hidden: width of each hidden layer of one critic, at least one.
-        layer_norm: normalise each hidden layer before its ReLU.
     """
 
     n_critics: int = 2
-    n_quantiles: int = 25
-    hidden: tuple[int, ...] = (256, 256)
-    layer_norm: bool = False
+    n_quantiles: int = 25  # per critic
+    hidden: tuple[int, ...] = (256, 256)  # widths of one critic's hidden layers, at least one
+    layer_norm: bool = False  # normalise each hidden layer before its ReLU
 
     @nn.compact
     def __call__(self, obs: Array, action: Array, ahead: Array | None = None) -> Array:
@@ -232,9 +211,6 @@ class Predictor(nn.Module):
 
     Source: critics that observe a learned prediction, Fujimoto et al., "For SALE: State-Action Representation
     Learning for Deep Reinforcement Learning", NeurIPS 2023.
-
-    Attributes:
-        hidden: width of each hidden layer.
     """
 
     hidden: tuple[int, ...] = (256, 256)
@@ -251,18 +227,13 @@ class Predictor(nn.Module):
 
 
 class PredictiveCritics:
-    """Quantile critics that observe the errors predicted for an action that is held.
+    """Quantile critics that observe the errors predicted for `n_ahead` actions, while an action is held.
 
     It takes the place of `Critics`. The critics' loss does not teach the predictor; `loss` does. The
     quantiles fall in proportion to the norms of the predicted errors.
 
     Source: critics that fall with a distance to the goal, Liu et al., "Metric Residual Networks for Sample
     Efficient Goal-Conditioned Reinforcement Learning", AAAI 2023.
-
-    Args:
-        critics: networks of the quantiles.
-        predictor: network of the prediction.
-        n_ahead: number of actions that are predicted.
     """
 
     def __init__(self, critics: Critics, predictor: Predictor, n_ahead: int):
@@ -318,8 +289,12 @@ class TQCState(NamedTuple):
 
 
 # Fields of the state by the names of the parts that another run may begin with, beside the policy.
-_PARTS = {"actor": "actor_params", "critics": "critic_params", "targets": "target_params"}
-_PARTS |= {"log_alpha": "log_alpha"}
+_PARTS = {
+    "actor": "actor_params",
+    "critics": "critic_params",
+    "targets": "target_params",
+    "log_alpha": "log_alpha",
+}
 
 
 class TQC:
@@ -386,14 +361,8 @@ class TQC:
     def update(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
         """Take one gradient step of critics, actor and temperature, then average critics and actor.
 
-        All three gradients are taken at the incoming state, so none waits for another's optimiser.
-
-        Returns:
-            The next state, and scalar metrics named `tqc/...`: the losses, alpha, entropy [nat], means of
-            the quantiles and of the targets.
-
-        Raises:
-            ValueError: a field of `batch` has the wrong shape.
+        All three gradients are taken at the incoming state, so none waits for another's optimiser. Metrics
+        are named `tqc/...`; the entropy is in nat. Raises ValueError for a field of the wrong shape.
         """
         batch.check(self.obs_size, self.action_size)
         # Targets of the critics, constants of the step.

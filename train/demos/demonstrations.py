@@ -36,15 +36,7 @@ class Demonstrations(NamedTuple):
 
 
 def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
-    """Read a file and check all of it.
-
-    Args:
-        path: CSV, or npz by the end of its name.
-        spec: the arm that learns from the file.
-
-    Raises:
-        LogError: the file cannot be used; the message has a line for each finding.
-    """
+    """Return the demonstrations of a file, CSV or npz, for an arm; see `read_demonstrations`."""
     return from_log(read_demonstrations(path, spec)[0], spec)
 
 

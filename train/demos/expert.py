@@ -191,16 +191,17 @@ class ExpertError(InputError):
 class Expert:
     """Solver for one arm, in one pipe or in open space."""
 
-    def __init__(self, spec: ArmSpec, s2r: S2R | None = None, pipe: CrossPipe | None = None, seed: int = 0):
+    def __init__(self, spec: ArmSpec, s2r: S2R | None = None, pipe: CrossPipe | None = None):
         self.spec, self.pipe = spec, pipe
+        self._limits_kpa = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
         arm = {"params": ArmParams.from_spec(spec), "s2r": s2r, "spec": spec, "pipe": pipe}
         self._look, self._solve = (functools.partial(_compiled(f), **arm) for f in (look_many, solve_many))
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(0)
         pool = self.look(random_pressures(spec, N_POOL, self._rng))
         self._pool = jax.tree.map(lambda x: x[self._slack(pool).min(axis=-1) >= 0.0], pool)
 
     def look(self, pressure_kpa: np.ndarray) -> Posture:
-        """Return the postures at pressures (n, n_chambers) [kPa]."""
+        """Return the postures (n,) at pressures (n, n_chambers)."""
         return xla.in_batches(self._look, _BATCH, pressure_kpa)
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Posture:
@@ -247,7 +248,7 @@ class Expert:
 
     def _starts(self, target: PostureTarget) -> np.ndarray:
         """Return pressures (N_STARTS, n_chambers): around the previous posture, and from the pool."""
-        low, high = self._limits_kpa()
+        low, high = self._limits_kpa
         jitter = JITTER_KPA * self._rng.standard_normal((N_JITTERED, len(target.near_kpa)))
         jitter[0] = 0.0
         near = np.clip(target.near_kpa + jitter, low, high)
@@ -256,13 +257,9 @@ class Expert:
         chosen = np.argsort(off_m + 0.02 * far)[: N_STARTS - N_JITTERED]
         return np.concatenate([near, self._pool.pressure_kpa[chosen]])
 
-    def _limits_kpa(self) -> tuple[float, float]:
-        chambers = self.spec.chambers
-        return chambers.pressure_min_kpa, chambers.pressure_max_kpa
-
     def _room_kpa(self, postures: Posture, target: PostureTarget) -> np.ndarray:
         """Return the distance (n, n_chambers) of the real arm's pressures to the nearest limit."""
-        (low, high), real_kpa = self._limits_kpa(), postures.pressure_kpa + target.bias_kpa
+        (low, high), real_kpa = self._limits_kpa, postures.pressure_kpa + target.bias_kpa
         return np.minimum(real_kpa - low, high - real_kpa)
 
     def _slack(self, postures: Posture, target: PostureTarget | None = None) -> np.ndarray:
@@ -286,10 +283,10 @@ class Expert:
         return np.nan_to_num(np.stack(demands, axis=-1), nan=-np.inf)
 
     def _why(self, name: str, target: PostureTarget, postures: Posture, slack: np.ndarray) -> str:
-        """Return the text of an error: errors, clearance and tightest chamber of the best solution."""
+        """Return the message of an error: the best solution, and what was expected of it."""
         best = int(np.argmax(np.minimum(slack, 0.0).sum(axis=-1)))
         off_m, turn_rad = (value[best] for value in _off(postures, target))
-        low, high = self._limits_kpa()
+        low, high = self._limits_kpa
         chamber = int(np.argmin(self._room_kpa(postures, target)[best]))
         kpa = (postures.pressure_kpa[best] + target.bias_kpa)[chamber]
         finger = ", ".join(f"{1e3 * value:.0f}" for value in target.finger_m)

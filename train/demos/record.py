@@ -1,5 +1,6 @@
-"""Demonstrations recorded on an arm, through its springs, pumps and motion capture alone.
+"""Commands `python -m train demos record | check`: demonstrations from an arm, and the contents of a file.
 
+An arm is recorded through its springs, pumps and motion capture alone.
 The sensor-space law holds the expert's references until the arm is at rest. Then motion capture gives the
 error of the finger tips, and the expert is asked for a pose that is shifted by this error. Without motion
 capture the error stays unknown, and the planned pose is logged. Between moves the pumps keep their pressures.
@@ -8,20 +9,32 @@ capture the error stays unknown, and the planned pose is logged. Between moves t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
+import tyro
 
+from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.drive import Drive, Hold
-from mjx_softarm.deploy.ending import Ending, vent_at_end
+from mjx_softarm.deploy.drivers import names
+from mjx_softarm.deploy.drivers.names import check_number
+from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, Ending, save_log, vent_at_end
 from mjx_softarm.deploy.link import ArmFault, Recorder
+from mjx_softarm.logs.files import check_file
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.policy.lag import SETTLE_TIMEOUT_S
 from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
+from mjx_softarm.spec import ArmSpec
+from train.demos.demonstrations import from_log, read_demonstrations
 from train.demos.expert import Expert, ExpertError, Posture, PostureTarget
-from train.demos.waypoints import Waypoint
+from train.demos.waypoints import TASKS, Waypoint, task
+from train.options import ArmOptions, start
 
 CLOSE_M = 1.5e-3  # error of the finger tips below which nothing is corrected
 FAR_M = 0.01  # error of the finger tips above which a pose is not worth learning from
@@ -59,19 +72,13 @@ class WaypointRecorder:
         self._rows, self._off_m = Recorder(), []
         self._readings = np.empty(0)  # (n_springs,) of the newest tick
 
-    def record(self, waypoints: Sequence[Waypoint], plan: Posture, sequence: int = 0) -> RecordedPoses:
-        """Bring the finger tips to waypoints, log each, and vent; see `vent_at_end`.
-
-        Args:
-            waypoints: one after the other.
-            plan: postures (n,) at the waypoints, by `Expert.plan`.
-            sequence: id of the demonstration.
-        """
+    def record(self, waypoints: Sequence[Waypoint], plan: Posture) -> RecordedPoses:
+        """Bring the finger tips to waypoints as `Expert.plan` planned, log each, and vent at the end."""
 
         def run() -> None:
             for k, waypoint in enumerate(waypoints):
                 row, off_m = self._reach(waypoint, jax.tree.map(lambda x, k=k: x[k], plan))
-                self._rows.add(row | {"sequence": sequence})
+                self._rows.add(row | {"sequence": 0})
                 self._off_m.append(off_m)
                 seen = f"{1e3 * off_m:.1f} mm off" if np.isfinite(off_m) else "not seen"
                 self.report(f"{len(self._rows)} of {len(waypoints)}: {waypoint.name}: {seen}")
@@ -120,12 +127,9 @@ class WaypointRecorder:
     def _corrected(
         self, row: dict, target: PostureTarget, asked: PostureTarget
     ) -> tuple[float, PostureTarget]:
-        """Return the error [m] of the finger tips, NaN if not seen, and the target to ask the expert for.
+        """Return the error [m] of the finger tips, NaN if not seen, and the next target of the expert.
 
-        Args:
-            row: row at rest.
-            target: target of the waypoint.
-            asked: target for which the expert found the present posture.
+        `asked` is the target for which the expert found the present posture.
         """
         if "tip_m" not in row:
             return np.nan, asked
@@ -155,3 +159,68 @@ class WaypointRecorder:
 
     def _tick(self, row: dict) -> None:
         self._readings = row["readings"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(ArmOptions):
+    """Bring an arm's finger tips to waypoints, and log the static poses there."""
+
+    arm: str
+    """twin:SEED, twin:SEED:pipe300, twin:SEED:500g, or package.module:Class, a driver of your own"""
+    task: Annotated[str, cli.one_of(TASKS)]
+    """task with its waypoints and its pipe"""
+    out: Path
+    """file to write, CSV or npz"""
+
+    def __call__(self) -> int:
+        console = start()
+        say = partial(console.print, soft_wrap=True)
+        check_file("--out", self.out)
+        if self.out.exists():
+            raise InputError(f"--out: got {self.out}, which is there already, expected a new file")
+        # Plan all postures before the arm moves.
+        spec, s2r, _ = self.read_arm(console)
+        arm = names.open_arm(self.arm)
+        check_number(arm, spec, f"--arm {self.arm}")
+        waypoints, pipe = task(self.task, spec)
+        expert = Expert(spec, s2r, pipe)
+        plan = expert.plan(waypoints)
+        # Record, and report the poses and errors.
+        recorder = WaypointRecorder(arm, expert, say, partial(save_log, self.out))
+        result = recorder.record(waypoints, plan)
+        if len(result.log) and result.ending.status != NOT_WRITTEN:
+            say(f"demonstrations: {self.out}, {len(result.log)} poses")
+            if np.isfinite(result.off_m).any():
+                say(f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
+        if result.ending.cause:
+            say(f"ended early: {result.ending.cause}")
+        return result.ending.status or (DONE if len(result.log) else MISSED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(ArmOptions):
+    """Print the contents of a file of demonstrations, and its faults."""
+
+    file: tyro.conf.Positional[Path]
+    """CSV or npz"""
+
+    def __call__(self) -> int:
+        console = start()
+        spec = self.read_arm(console).spec
+        log, findings = read_demonstrations(self.file, spec)
+        for text in (*_summary(log, spec), *map(str, findings)):
+            console.print(text, soft_wrap=True)
+        return 0
+
+
+def _summary(log: Log, spec: ArmSpec) -> list[str]:
+    demos = from_log(log, spec)
+    ids, counts = np.unique(demos.sequence, return_counts=True)
+    sequences = ", ".join(f"{k} with {count}" for k, count in zip(ids, counts, strict=True))
+    low, high = demos.positions.min(axis=0), demos.positions.max(axis=0)
+    ranges = ", ".join(f"{axis} {low[k]:.0f} to {high[k]:.0f}" for k, axis in enumerate("xyz"))
+    return [
+        f"poses: {len(log)}, tip [mm]: {ranges}",
+        f"sequences: {len(ids)}: {sequences}",
+        f"actions: {demos.actions.min():.3f} to {demos.actions.max():.3f} of -1 to 1",
+    ]

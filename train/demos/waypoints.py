@@ -57,9 +57,7 @@ def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:
 def pick_and_place(pipe: CrossPipe, stops: Sequence[tuple[str, int]]) -> tuple[Waypoint, ...]:
     """Return waypoints from home through the crossing to each stop, in moves of equal length.
 
-    Args:
-        pipe: the pipe.
-        stops: name, whose last word is a container or "home", and number of moves, of each stop.
+    Stops are names, whose last word is a container or "home", and numbers of moves.
     """
     places = dict(pipe.containers())
     crossing = np.array([0.0, 0.0, places["right"][2]])

@@ -26,26 +26,13 @@ class Ring(NamedTuple):
 
 
 def create(example_item: Items, capacity: int) -> Ring:
-    """Return an empty ring.
-
-    Args:
-        example_item: pytree of one item (arrays or `jax.ShapeDtypeStruct`): structure, shapes and dtypes.
-        capacity: number of slots N.
-    """
-    item = jax.eval_shape(lambda x: x, example_item)
-    data = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), item)
+    """Return an empty ring of N slots for items shaped as one item, of arrays or `jax.ShapeDtypeStruct`."""
+    data = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), example_item)
     return Ring(data, position=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
 
 
 def finite_rows(items: Items) -> Array:
-    """Return which items have finite numbers alone, as part of `valid` in `add`.
-
-    Args:
-        items: pytree of leaves (B, ...).
-
-    Returns:
-        finite (B,) bool.
-    """
+    """Return which items (B, ...) have finite numbers alone: (B,) bool, as part of `valid` in `add`."""
     rows = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(items)]
     return jnp.all(jnp.stack(rows), axis=0)
 
@@ -73,17 +60,9 @@ def add(replay: Ring, items: Items, valid: Array) -> Ring:
 
 
 def sample(replay: Ring, key: Array, batch_size: int) -> Items:
-    """Draw items uniformly, with replacement, from the filled slots.
+    """Draw items (B, ...) uniformly, with replacement, from the filled slots.
 
     The number of filled slots is known only at run time, so an empty ring does not raise: it yields zeros.
-
-    Args:
-        replay: ring with at least one item.
-        key: PRNG key.
-        batch_size: number of items B.
-
-    Returns:
-        Pytree of leaves (B, ...).
     """
     slot = draws.integers(key, batch_size, replay.size)
     return jax.tree.map(lambda ring: ring[slot], replay.data)
@@ -102,9 +81,8 @@ def sample_ahead(
         n_ahead: largest number of additions between an item and its later item.
 
     Returns:
-        Pytrees of leaves (B, ...): items, and later items; the number of additions between the two, (B,) from
-        0 to `n_ahead`. Where the ring does not have that later item yet, or an addition left rows out, the
-        later item is an unrelated one.
+        Items and later items (B, ...); the number of additions between the two, (B,) from 0 to `n_ahead`.
+        Where the ring does not have that later item yet, or an addition left rows out, it is unrelated.
     """
     key_slot, key_ahead = jax.random.split(key)
     slot = draws.integers(key_slot, batch_size, replay.size).astype(jnp.int32)
@@ -116,13 +94,7 @@ def sample_ahead(
 
 
 def thin(replay: Ring, key: Array, share: Array) -> Ring:
-    """Return the ring with a random share of its items, oldest first, for a stage with other goals.
-
-    Args:
-        replay: ring of N slots.
-        key: PRNG key.
-        share (): share of the filled slots to keep, 0 to 1.
-    """
+    """Return the ring with a random share () of its items, oldest first, for a stage with other goals."""
     capacity = _capacity(replay)
     age = (jnp.arange(capacity) - replay.position) % capacity  # oldest first, once the ring is full
     filled = jnp.arange(capacity) < replay.size

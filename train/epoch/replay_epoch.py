@@ -24,6 +24,7 @@ from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.mdp.actions import N_ACTIONS
 from train.agent.hindsight import HindsightConfig, later_pose, relabel
 from train.agent.learner import Experience, LearnerConfig, Transition
+from train.demos.demonstrations import Demonstrations
 from train.epoch import replay
 
 COUNTS = ("env/unsettled", "env/episodes", "env/successes")  # metrics summed over an epoch and its arms
@@ -50,6 +51,14 @@ class ReplayConfig(LearnerConfig):
             "replay_capacity": (self.replay_capacity >= self.n_arms, f"at least n_arms = {self.n_arms}"),
         }
         check_settings("learner", self, required)
+
+    def make_learner(self, env: ReachEnv) -> Learner:
+        """Return the learner, for the observations and actions of an environment."""
+        raise NotImplementedError
+
+    def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> ReplayEpoch:
+        """Return the epoch of the learner, with starts and goals as the environment draws them."""
+        return ReplayEpoch(self, env, self.make_learner(env))
 
     @property
     def n_updates_per_vector_step(self) -> int:
@@ -88,10 +97,7 @@ class Learner(Protocol):
         ...
 
     def policy(self, state: Any) -> Any:
-        """Return the parameters of the policy that is evaluated and exported.
-
-        Export needs them named and shaped as those of `train.agent.networks.Actor`.
-        """
+        """Return the parameters of the policy, for export named and shaped as those of `networks.Actor`."""
         ...
 
     def mode(self, policy: Any, obs: Array) -> Array:
@@ -99,18 +105,11 @@ class Learner(Protocol):
         ...
 
     def parts(self, state: Any) -> dict[str, Any]:
-        """Return trees of arrays by name that each checkpoint keeps for export and for other runs.
-
-        `policy` is the policy. A learned reward is called `reward`.
-        """
+        """Return trees of arrays that checkpoints keep for export and other runs: `policy`, `reward`, ..."""
         ...
 
     def adopt(self, state: Any, parts: dict[str, Any]) -> Any:
-        """Return the state with parts of another run's learner in the place of its own.
-
-        Raises:
-            ValueError: a part is missing, has another size, or cannot be taken.
-        """
+        """Return the state with parts of another run's learner; ValueError where one cannot be taken."""
         ...
 
 
@@ -128,11 +127,7 @@ class ReplayState(NamedTuple):
 class ReplayEpoch:
     """Epoch of a learner from the replay.
 
-    Args:
-        config: settings.
-        env: the arm.
-        learner: learner.
-        goals: `train.agent.imitation.DemonstratedGoals`; None: as the environment draws starts and goals.
+    `goals` are `train.agent.imitation.DemonstratedGoals`; None: the environment draws starts and goals.
     """
 
     def __init__(self, config: ReplayConfig, env: ReachEnv, learner: Learner, goals: Any = None):
@@ -149,7 +144,7 @@ class ReplayEpoch:
         # The replay has the shapes of the transitions that the arms will make.
         action = jax.eval_shape(self.learner.act, learner, arms.obs, key)
         experience = jax.eval_shape(self._experience, arms, action, arms)
-        one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), experience)
         memory = replay.create(one, self.config.replay_capacity)
         return ReplayState(arms, learner, memory, goals, key, n_epochs=jnp.zeros((), jnp.int32))
 
@@ -186,7 +181,7 @@ class ReplayEpoch:
         memory = replay.add(state.memory, experience, valid)
 
         # Learn.
-        learner, losses = self.learn(state.learner, memory, key_updates, warmed_up)
+        learner, losses = self._learn(state.learner, memory, key_updates, warmed_up)
         ended = outcome.terminated | outcome.truncated
         of_arms = after.metrics | {"episodes": ended, "successes": ended & (after.metrics["reached"] > 0)}
         env_metrics = {f"env/{name}": jnp.mean(value) for name, value in of_arms.items()}
@@ -202,20 +197,16 @@ class ReplayEpoch:
         epochs, steps = divmod(self.config.n_warmup_vector_steps, self.config.vector_steps_per_epoch)
         return (n_epochs > epochs) | ((n_epochs == epochs) & (step >= steps))
 
-    def learn(
+    def _learn(
         self, learner: Any, memory: replay.Ring, key: Array, warmed_up: Array
     ) -> tuple[Any, dict[str, Array]]:
-        """Take the updates of one vector step, none before the end of warm-up.
-
-        Returns:
-            The learner's next state; means over the updates by name, zeros during warm-up.
-        """
+        """Take the updates of one vector step, none during warm-up; return the learner's state and means."""
         keys = jax.random.split(key, self.config.n_updates_per_vector_step)
 
         def update(learner: Any, key: Array) -> tuple[Any, dict[str, Array]]:
             key_sample, key_relabel, key_update = jax.random.split(key, 3)
             stored = self._sample(memory, key_sample)
-            batch = self.relabel(stored, key_relabel)
+            batch = relabel(stored, key_relabel, self.config.hindsight, self.env)
             return self.learner.update(learner, batch, key_update)
 
         @jax.jit  # traced once for the branch and the shapes of its results
@@ -235,18 +226,6 @@ class ReplayEpoch:
             return replay.sample(memory, key, size)
         now, later, ahead = replay.sample_ahead(memory, key, size, self.arms.n, n_later)
         return now._replace(later_pose=later_pose(now, later, ahead))
-
-    def relabel(self, stored: Experience, key: Array) -> Transition:
-        """Return a batch to learn from; some of its B transitions have another goal."""
-        return relabel(
-            stored,
-            key,
-            self.config.hindsight,
-            self.env.scale,
-            self.env.config.reward,
-            goal_ends=self.env.config.goal_ends,
-            senses_action=self.env.config.observation == "motion",
-        )
 
     def _experience(self, before: State, action: Array, after: State) -> Experience:
         """Return the transitions of n arms as they are stored."""

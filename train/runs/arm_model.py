@@ -1,4 +1,11 @@
-"""Networks and workspace of an arm for its computer; the same for every policy that drives the arm."""
+"""Networks and workspace of an arm for its computer; the same for every policy that drives the arm.
+
+The estimators of load, pose and springs (`mjx_softarm.sensing.estimator`, `mjx_softarm.sensing.load`) learn
+equilibria over the whole workspace, and are tested on held-out ones. No calibration is perfect. So the load
+network learns how well the log of the arm shows the pressures that hold it
+(`mjx_softarm.sensing.held_pressures`), or, without a log, by how much arms differ whose chambers are off. The
+pose is not estimated from pressures: a chamber's error would pass for a change of shape.
+"""
 
 from __future__ import annotations
 
@@ -11,31 +18,85 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 import mjx_softarm
 from calib.arm import CalibratedArm
 from calib.fit import payload
+from calib.fit.payload import effect_of_s2r, held_at
+from calib.fit.s2r import simulate_poses
+from mjx_softarm._support import xla
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
-from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
+from mjx_softarm._support.training import Schedule, initial_layers, train_network
+from mjx_softarm._support.xp import array_namespace
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.workspace import (
+    CANDIDATES_PER_POSE,
+    HELD_OUT_SEED,
+    LoadedPool,
+    Pool,
+    sample_evenly,
+    sample_loaded,
+    sample_workspace,
+)
 from mjx_softarm.policy.file import ArmModel, take_networks
+from mjx_softarm.posture import hangs
+from mjx_softarm.sensing.estimator import (
+    N_CHANGES,
+    N_TERMS,
+    N_VARIABLES,
+    Frame,
+    PoseEstimator,
+    SpringModel,
+    arcs,
+    estimate_frame,
+    expected_springs,
+    first_moments,
+    polynomial_terms,
+    section_shapes,
+    variables,
+)
+from mjx_softarm.sensing.held_pressures import held_kpa, residual
+from mjx_softarm.sensing.load import (
+    COMMON_FACTOR,
+    HIGHEST,
+    LOWEST,
+    LoadEstimator,
+    estimate_load,
+    holding,
+)
+from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_rotation
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
-from train.runs import estimator
-from train.runs.estimator import distil
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
-N_STEPS = estimator.N_STEPS + 1  # steps that `arm_model` reports: the networks' and the workspace
-SEED = 0  # seed of the networks and of the workspace
+SEED = 0  # seed of equilibria, initial weights, batches and the workspace; it is not that of held-out poses
 ESTIMATORS_FILE, _KIND = "estimators.npz", "estimators"
 _NAMES = "estimator", "load_estimator", "spring_model"
+N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 2_048, 2_048
+# Share of the pressure range that is added at either end for poses. Much more brings sections that are about
+# to buckle, which no polynomial follows: with 0.25, the paper's arm has 3.7 mm at 95 % instead of 0.1.
+MORE_PRESSURE = 0.05
+RIDGE = 1e-8  # added to the mean squares of the polynomial's terms
+SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
+LOAD_SCHEDULES = 2  # schedules for which the payload's network learns
+PRESSURE_WEIGHT = 4.0  # of the pressures in its loss: they tell the payload more than its other outputs
+PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
+CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
+WIDTH = 128  # width of the networks' hidden layers
+LEAST_SCALE = 1e-6  # least scale of an output off its plane: without a log, one variance holds everywhere
+# Median, 95 % and largest error ("median", "p95", "largest") by quantity and payload, such as "0.5 kg"
+Errors = dict[str, dict[str, dict[str, float]]]
 
 
 class DistilledArm(NamedTuple):
     """A model of an arm, with the errors of its networks."""
 
     model: ArmModel
-    errors: dict[str, Any]  # by name and payload, in types that JSON has
+    errors: Errors
 
 
 _distilled: dict[str, DistilledArm] = {}  # by key, of this process
@@ -49,7 +110,7 @@ def arm_model(
     Args:
         arm: the arm, calibrated or not.
         folder: keeps the model in a file, which is used again for the same arm and the same code.
-        say: takes a text before each of `N_STEPS` steps; of none where the model is kept.
+        say: takes a text before each step; of none where the model is kept.
 
     Raises:
         SpecError: the arm settles at too few pressures.
@@ -58,18 +119,328 @@ def arm_model(
     if file and (kept := _read(file, key, arm)):
         return kept
     if key not in _distilled:
-        distilled = distil(arm, SEED, say)
-        errors = {
-            name: {f"{kg:g} kg": error._asdict() for kg, error in by_payload.items()}
-            for name, by_payload in distilled.errors.items()
-        }
-        say("simulating the workspace")
-        model = ArmModel(_workspace(arm.spec, arm.s2r), *distilled[:3], arm.s2r)
-        _distilled[key] = DistilledArm(model, errors)
+        _distilled[key] = distil(arm, say)
     if file:
         with contextlib.suppress(SealedFileError):  # a folder to read only: the next export distils anew
             _write(file, key, _distilled[key])
     return _distilled[key]
+
+
+def distil(arm: CalibratedArm, say: Callable[[str], object] = lambda step: None) -> DistilledArm:
+    """Return the model of an arm, always the same for the same arm.
+
+    Args:
+        arm: the arm, calibrated or not.
+        say: takes a text before each step.
+
+    Raises:
+        SpecError: the arm settles at too few pressures.
+    """
+    spec, keys = arm.spec, _keys()
+    say("fitting the pose estimator")
+    estimator = fit_pose(spec)
+    # Learn what holds the arm, with a payload and without, and the springs of the unloaded arm.
+    say("training the payload estimator")
+    load_estimator = fit_load_estimator(arm)
+    say("training the model of the springs")
+    unloaded = _as_measured(arm, sample_workspace(spec, N_TRAINING, SEED))
+    springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
+    say("simulating the workspace")
+    networks = estimator, load_estimator, springs
+    estimator, load_estimator, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), networks)
+    model = ArmModel(_workspace(spec, arm.s2r), estimator, load_estimator, springs, arm.s2r)
+    say("testing them at held-out poses")
+    return DistilledArm(model, _errors(model, arm))
+
+
+def fit_pose(spec: ArmSpec) -> PoseEstimator:
+    """Return the pose estimator of an arm, least squares over simulated poses with payloads."""
+    # Poses, with the ends of their sections, and what these are off constant curvature
+    pool = sample_loaded(_stronger(spec), _payloads(spec), 0.0, SEED)
+    sections, ups = _sections(spec, pool.q)
+    estimator = _first_estimator(spec)
+    length, bend = section_shapes(estimator.spring_site_m, np.asarray(pool.spring_m, float))
+    even = arcs(length, bend)
+    turn = quaternion_from_rotation(sections.rotation @ even.rotation.swapaxes(-1, -2))
+    gibbs = turn[..., 1:] / turn[..., :1]
+    changes = np.concatenate([sections.position_m - even.position_m, gibbs], axis=-1)
+
+    # A polynomial for each section
+    load_kg = np.asarray(pool.load_kg, float)[:, None]
+    moments = first_moments(estimator, length, sections, load_kg)
+    loads_kg = load_kg[:, None] * np.ones_like(length)
+    every = variables(length, bend, even.rotation, ups, moments, loads_kg)
+    fits = list[tuple[np.ndarray, np.ndarray, np.ndarray]]()
+    for k, x in enumerate(np.moveaxis(every, 1, 0)):
+        low, high = x.min(axis=0), x.max(axis=0)
+        centre, scale = (low + high) / 2.0, np.maximum((high - low) / 2.0, LEAST_SCALE)
+        terms = polynomial_terms(((x - centre) / scale).T)  # (N_TERMS, n)
+        size = np.maximum(np.sqrt(np.mean(terms**2, axis=1)), LEAST_SCALE)
+        terms /= size[:, None]
+        square = terms @ terms.T / len(x) + RIDGE * np.eye(N_TERMS)
+        weights = np.linalg.solve(square, terms @ changes[:, k] / len(x))
+        fits.append((weights / size[:, None], centre, scale))
+    coefficient, centre, scale = (np.stack(parts) for parts in zip(*fits, strict=True))
+    return estimator._replace(coefficient=coefficient, variable_centre=centre, variable_scale=scale)
+
+
+def _sections(spec: ArmSpec, q: Array) -> tuple[Frame, np.ndarray]:
+    """Return the ends of the sections (n, n_sections) of arms with joint coordinates (n, nv).
+
+    They are in the frames of the sections' starts. Beside them stand the directions against gravity
+    (n, n_sections, 3) in these frames.
+    """
+    frames = xla.jit(jax.vmap(chain_kinematics(ArmParams.from_spec(spec))))(q)
+    links = spec.structure.links_per_section
+    position_m = np.asarray(frames.plate_position, float)[:, ::links]
+    rotation = np.asarray(frames.plate_rotation, float)[:, ::links]
+    start = rotation[:, :-1].swapaxes(-1, -2)
+    moved_m = (start @ np.diff(position_m, axis=1)[..., None])[..., 0]
+    return Frame(moved_m, start @ rotation[:, 1:]), rotation[:, :-1, 2]
+
+
+def _first_estimator(spec: ArmSpec) -> PoseEstimator:
+    """Return the pose estimator of an arm whose sections bend evenly, in double precision."""
+    params, n_sections = ArmParams.from_spec(spec), spec.structure.n_sections
+    mount = params.mount
+    fields = {
+        "coefficient": np.zeros((n_sections, N_TERMS, N_CHANGES)),
+        "variable_centre": np.zeros((n_sections, N_VARIABLES)),
+        "variable_scale": np.ones((n_sections, N_VARIABLES)),
+        "spring_site_m": params.spring_site_m,
+        "section_mass_kg": np.reshape(params.link_mass_kg, (n_sections, -1)).sum(axis=1),
+        "gripper_mass_kg": params.tool_mass_kg[0],
+        "tool_offset_m": params.tool_offset_m,
+        "base_position_m": mount.base_position_m,
+        "base_rotation": mount.base_rotation,
+        "tip_offset_m": mount.tip_offset_m,
+        "tip_rotation": mount.tip_rotation,
+    }
+    return PoseEstimator(**{name: np.asarray(value, float) for name, value in fields.items()})
+
+
+def _payloads(spec: ArmSpec) -> np.ndarray:
+    """Draw payloads [kg] of the candidates for poses to learn from."""
+    share = np.random.default_rng([SEED, 1]).uniform(LOWEST, HIGHEST, CANDIDATES_PER_POSE * N_TRAINING)
+    return (spec.mass.payload_kg + spec.mass.largest_payload_kg) * share
+
+
+def _chambers_off(arm: CalibratedArm) -> float:
+    """Return the share by which chambers may be off: a log of the arm shows its own."""
+    return CHAMBERS_OFF if arm.held is None else 0.0
+
+
+def fit_load_estimator(arm: CalibratedArm) -> LoadEstimator:
+    """Return the payload network of an arm, learned at poses with payloads; see `distil`."""
+    spec, _, held = arm
+    loaded = sample_loaded(spec, _payloads(spec), _chambers_off(arm), SEED)
+    own_kg, n_sections = spec.mass.payload_kg, spec.structure.n_sections
+    # Pressures that hold the springs without a payload, and their change by one
+    at, both = held_at(arm, np.asarray(loaded.spring_m))
+    spring_m, light_kpa, effect = (values[both] for values in at)
+    # What the calibration knows of the real arm's pressures
+    if held is None:
+        load_kg, kpa = (np.asarray(values)[both] for values in (loaded.load_kg, loaded.pressure_kpa))
+        off_kpa = kpa - light_kpa - (load_kg - own_kg)[:, None] * effect
+        covariance = _square(off_kpa.reshape(len(kpa), n_sections, -1))
+        left_kpa, share = np.zeros_like(light_kpa), np.ones((len(kpa), n_sections))
+    else:
+        mean_kpa, share = residual(held, spring_m, light_kpa)
+        covariance, left_kpa = held.covariance_kpa2, mean_kpa.reshape(light_kpa.shape)
+    held_at_kpa = light_kpa + left_kpa + spec.unmodelled_kpa
+    # Learn, and judge by poses that are not learned
+    out = np.float32(np.concatenate([held_at_kpa, effect, np.log(share)], axis=1))
+    parts = np.split(spring_m, [-N_JUDGING]), np.split(out, [-N_JUDGING])
+    learned, judging = (_Holding(*map(jnp.asarray, part)) for part in zip(*parts, strict=True))
+    keys = _keys()
+    first = _first_load_estimator(arm, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
+    network = _fit(first, _holding_loss, learned, keys[4], n_schedules=LOAD_SCHEDULES)
+    # The network's own error. It is larger at the rim, so the intervals of 95 % of these poses shall hold it.
+    predicted_kpa = holding(network, judging.spring_m).pressure_kpa
+    true_kpa = judging.out[:, : spec.n_chambers]
+    error = _square(predicted_kpa - true_kpa.reshape(predicted_kpa.shape))
+    alone = network._replace(covariance_kpa2=jnp.zeros_like(error), error_kpa2=error)
+    estimated_kg, half_width_kg = estimate_load(alone, judging.spring_m, true_kpa)
+    widened = jnp.quantile(jnp.abs(estimated_kg - own_kg) / half_width_kg, 0.95) ** 2
+    return network._replace(error_kpa2=widened * error)
+
+
+class _Holding(NamedTuple):
+    """Springs, and the outputs of `LoadEstimator` there."""
+
+    spring_m: Array  # (n, n_springs)
+    out: Array  # (n, n_out)
+
+
+def _square(off_kpa: Any) -> Any:
+    """Return the mean squares (s, c, c) of pressures (n, s, c) that are off."""
+    xp = array_namespace(off_kpa)
+    return xp.einsum("nsi,nsj->sij", off_kpa, off_kpa) / len(off_kpa)
+
+
+def _keys() -> Array:
+    return jax.random.split(jax.random.key(SEED), 7)
+
+
+def _loaded(arm: CalibratedArm, many_kg: np.ndarray) -> LoadedPool:
+    """Draw held-out poses of arms with payloads [kg], off as far as the calibration does not tell."""
+    pool = sample_loaded(arm.spec, many_kg, _chambers_off(arm), HELD_OUT_SEED)
+    if arm.held is None:
+        return _as_measured(arm, pool)
+    # The effect of the payload is the difference to the arm without it, held at the same springs.
+    light = simulate_poses(arm.spec, np.asarray(pool.spring_m))
+    pool = jax.tree.map(lambda values: np.asarray(values)[light.valid], pool)
+    light_kpa, own_kg = light.pressure_kpa[light.valid], arm.spec.mass.payload_kg
+    effect_kpa = pool.pressure_kpa - light_kpa
+    effect_kpa += (pool.load_kg - own_kg)[:, None] * effect_of_s2r(arm, pool.spring_m)
+    kpa = _held(arm, pool.spring_m, light_kpa, effect_kpa, np.random.default_rng([HELD_OUT_SEED, 2]))
+    return pool._replace(pressure_kpa=jnp.asarray(kpa, jnp.float32))
+
+
+def _as_measured(arm: CalibratedArm, pool: Any) -> Any:
+    """Return poses with the pressures that hold the real arm without a payload, as far as they are known."""
+    spring_m, kpa = np.asarray(pool.spring_m), np.asarray(pool.pressure_kpa)
+    return pool._replace(pressure_kpa=jnp.asarray(_held(arm, spring_m, kpa, np.zeros_like(kpa)), jnp.float32))
+
+
+def _held(
+    arm: CalibratedArm,
+    spring_m: np.ndarray,
+    light_kpa: np.ndarray,
+    effect_kpa: np.ndarray,
+    rng: np.random.Generator | None = None,
+) -> np.ndarray:
+    """Return the pressures that hold the real arm; see `held_kpa`."""
+    kpa = light_kpa + effect_kpa
+    if arm.held is not None:
+        kpa = held_kpa(arm.held, spring_m, light_kpa, effect_kpa, rng)
+    return kpa + arm.spec.unmodelled_kpa
+
+
+def _stronger(spec: ArmSpec) -> ArmSpec:
+    """Return the arm with more pressure: a real arm reaches spring lengths just beyond the simulated ones."""
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    more = MORE_PRESSURE * (high - low)
+    chambers = {"pressure_min_kpa": max(low - more, -100.0), "pressure_max_kpa": high + more}
+    return spec.replace(chambers=chambers)
+
+
+def _holding_loss(estimator: LoadEstimator, rows: _Holding) -> Array:
+    """Return the mean square of the outputs' errors, as shares of what a plane leaves."""
+    predicted = holding(estimator, rows.spring_m)
+    each = [x.reshape(len(rows.out), -1) for x in predicted]
+    off = (jnp.concatenate(each, axis=1) - rows.out) / estimator.out_scale
+    weight = jnp.ones(off.shape[1]).at[: each[0].shape[1]].set(PRESSURE_WEIGHT)
+    return jnp.mean(weight * off**2)
+
+
+def _spring_loss(model: SpringModel, pool: Pool) -> Array:
+    """Return the mean square of the springs' errors [mm]."""
+    return jnp.mean((1e3 * (expected_springs(model, pool.pressure_kpa) - pool.spring_m)) ** 2)
+
+
+def _fit(
+    network: Any,
+    loss: Callable[[Any, Any], Array],
+    pool: Any,
+    key: Array,
+    n_schedules: int = 1,
+) -> Any:
+    """Return the network with its layers trained; its other fields stay."""
+    schedule = SCHEDULE._replace(n_updates=n_schedules * SCHEDULE.n_updates)
+
+    def loss_of(weights: Any, rows: Any) -> Array:
+        return loss(network._replace(layers=weights), rows)
+
+    weights, _ = train_network(loss_of, network.layers, pool, schedule, key)
+    return network._replace(layers=weights)
+
+
+def _first_load_estimator(
+    arm: CalibratedArm, spring_m: Array, out: Array, covariance_kpa2: Array, key: Array
+) -> LoadEstimator:
+    """Return the payload network of an arm, with the plane that fits its outputs best.
+
+    `out` (n, n_out) are the outputs of `LoadEstimator` at spring lengths (n, n_springs). The arm's residual
+    pressures, with covariance (n_sections, c, c), tell the hysteresis.
+    """
+    scaling, centre = _scaling("spring", "m", spring_m), jnp.mean(out, axis=0)
+    springs = (spring_m - scaling["spring_centre_m"]) / scaling["spring_scale_m"]
+    slope = jnp.linalg.lstsq(springs, out - centre)[0]
+    rest = jnp.std(out - centre - springs @ slope, axis=0)
+    (n_in, n_out), own_kg = slope.shape, arm.spec.mass.payload_kg
+    held, at_chambers = arm.held, arm.spec.at_chambers
+    return LoadEstimator(
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
+        slope=slope,
+        **scaling,
+        out_centre=centre,
+        out_scale=jnp.maximum(rest, LEAST_SCALE),
+        covariance_kpa2=covariance_kpa2,
+        error_kpa2=jnp.zeros_like(covariance_kpa2),
+        hysteresis_kpa=jnp.asarray(at_chambers(0.0 if held is None else tuple(held.hysteresis_kpa))),
+        stroke_m=jnp.asarray(at_chambers(1.0 if held is None else tuple(held.stroke_m))),
+        own_load_kg=jnp.asarray(own_kg),
+        load_scale_kg=jnp.asarray(own_kg + arm.spec.mass.largest_payload_kg),
+        factor_sd=jnp.asarray(COMMON_FACTOR if held is None else held.factor_sd),
+    )
+
+
+def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
+    """Return the network from pressures to springs, scaled by poses of an arm."""
+    n_chambers, n_springs = pool.pressure_kpa.shape[1], pool.spring_m.shape[1]
+    return SpringModel(
+        layers=initial_layers(key, (n_chambers, WIDTH, WIDTH, n_springs)),
+        **_scaling("pressure", "kpa", pool.pressure_kpa),
+        **_scaling("spring", "m", pool.spring_m),
+    )
+
+
+def _scaling(name: str, unit: str, values: Array) -> dict[str, Array]:
+    """Return the fields of a network that standardise a quantity (n, ...)."""
+    return {
+        f"{name}_centre_{unit}": jnp.mean(values, axis=0),
+        f"{name}_scale_{unit}": jnp.std(values, axis=0),
+    }
+
+
+def _errors(learned: ArmModel, arm: CalibratedArm) -> Errors:
+    """Return errors by payload on top of the specification's.
+
+    `tip_mm` and `turn_deg` are errors of the estimated pose with the true load. `load_kg` is the error of
+    arms whose chambers are off, `spring_mm` the error of each arm's worst spring.
+    """
+    spec, errors_by_name = arm.spec, Errors()
+    for share in PAYLOADS:
+        payload_kg = share * spec.mass.largest_payload_kg
+        load_kg = spec.mass.payload_kg + payload_kg
+        loaded = spec.replace(mass={"payload_kg": load_kg})
+        # Compare pose and springs with equilibria of the arm as specified.
+        many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
+        if hangs(spec):
+            held_out = sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED)
+        else:  # at constant pressures it may buckle
+            held_out = sample_loaded(spec, many_kg, 0.0, HELD_OUT_SEED)
+        pool = jax.tree.map(np.asarray, _as_measured(arm, held_out))
+        position_m, rotation = frame_from_pose(pool.pose)
+        guess = estimate_frame(learned.estimator, pool.spring_m, load_kg)
+        chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
+        springs = np.abs(expected_springs(learned.spring_model, pool.pressure_kpa) - pool.spring_m)
+        # Estimate the load of arms whose chambers are off.
+        off = _loaded(arm, many_kg)
+        estimated_kg, half_width_kg = estimate_load(learned.load_estimator, off.spring_m, off.pressure_kpa)
+        errors = {
+            "tip_mm": 1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1),
+            "turn_deg": np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))),
+            "load_kg": np.abs(np.asarray(estimated_kg) - load_kg),
+            "load_half_width_kg": np.asarray(half_width_kg),
+            "spring_mm": 1e3 * springs.max(axis=-1),
+        }
+        for name, values in errors.items():
+            shares = {"median": 0.5, "p95": 0.95, "largest": 1.0}
+            quantiles = {label: float(np.quantile(values, share)) for label, share in shares.items()}
+            errors_by_name.setdefault(name, {})[f"{payload_kg:g} kg"] = quantiles
+    return errors_by_name
 
 
 def _write(file: Path, key: str, arm: DistilledArm) -> None:
@@ -96,14 +467,12 @@ def _read(file: Path, key: str, arm: CalibratedArm) -> DistilledArm | None:
 def _key(arm: CalibratedArm) -> str:
     """Return a checksum of the arm with its models, of the networks' settings, JAX and the code.
 
-    The code is `estimator.py` beside this file, `mjx_softarm/spec.py`, and the modules of `calib/fit` and of
+    The code is this file, `mjx_softarm/spec.py`, and the modules of `calib/fit` and of
     `_support`, `mechanics` and `sensing` in `mjx_softarm`, without subfolders. Versions of other packages,
     and the device, are not part of it.
     """
-    settings = [arm.spec.to_dict(), SEED, N_WORKSPACE, estimator.N_TRAINING, estimator.N_HELD_OUT]
-    digest = hashlib.sha256(
-        json.dumps([*settings, estimator.SCHEDULE, estimator.PAYLOADS, jax.__version__]).encode()
-    )
+    settings = [arm.spec.to_dict(), SEED, N_WORKSPACE, N_TRAINING, N_HELD_OUT]
+    digest = hashlib.sha256(json.dumps([*settings, SCHEDULE, PAYLOADS, jax.__version__]).encode())
     for values in jax.tree.leaves((arm.s2r, arm.held)):
         digest.update(np.asarray(values).tobytes())
     package = Path(mjx_softarm.__file__).parent
@@ -112,7 +481,7 @@ def _key(arm: CalibratedArm) -> str:
         Path(payload.__file__).parent,
     )
     modules = (file for folder in folders for file in sorted(folder.glob("*.py")))
-    for source in (package / "spec.py", Path(estimator.__file__), *modules):
+    for source in (package / "spec.py", Path(__file__), *modules):
         digest.update(source.read_bytes())
     return digest.hexdigest()
 

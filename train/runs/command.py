@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self, cast
+from typing import Annotated, Any, Literal, Self, cast
 
 import tyro
 from rich.console import Console
@@ -19,14 +20,56 @@ from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.config import ENGINES
 from train.agent.imitation import ImitationConfig
-from train.config import TrainConfig
+from train.config import LEARNERS, TrainConfig, name_of
 from train.demos.demonstrations import from_log, read_demonstrations
-from train.options import NewRunOptions, ReachOptions, named, start
-from train.presets import IMITATION_PRESETS
+from train.options import ArmOptions, start
+from train.presets import IMITATION_PRESETS, PRESETS, preset_of
 from train.runs import run as runs
 from train.runs.evaluate import N_ACTIONS
 from train.runs.folder import Run, sole_trainer
-from train.runs.task import Task, task_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewRunOptions(ArmOptions):
+    """Options of a command that makes a folder, or continues one."""
+
+    out: cli.MaybePath = None
+    """new folder; None: a name in runs/ after the preset"""
+    resume: cli.MaybePath = None
+    """folder to continue; its own settings hold"""
+
+    def check_resume_alone(self) -> None:
+        """Raise InputError for settings beside `--resume`: those that differ from the command's own."""
+        command: Any = self  # each has `config` and `default`
+        new = command.default([])
+        names = _differing(command, new, ("resume", "config")) + _differing(command.config, new.config)
+        if names:
+            given = ", ".join(f"--{name}" for name in dict.fromkeys(names))
+            raise InputError(f"--resume {self.resume}: got {given} too, expected none: its own settings hold")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReachOptions(NewRunOptions):
+    """Options of a command that trains policies which reach poses of the workspace."""
+
+    preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
+    """settings to begin with; the defaults below are this preset's"""
+    size: Literal["cpu", "gpu"] = "cpu"
+    """machine that the preset's numbers of arms, steps and transitions suit; gpu: of analytic and motion"""
+    learner: Annotated[str, cli.one_of(n for n, c in LEARNERS.items() if not c.FROM_DEMONSTRATIONS)] = "tqc"
+    """learner; where it is not the preset's, it begins with its own defaults"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+
+    @classmethod
+    def default(cls, arguments: Sequence[str]) -> Self:
+        preset = _named(arguments, "--preset", PRESETS, "quick")
+        size: Any = _named(arguments, "--size", ("cpu", "gpu"), "cpu")
+        config = preset_of(preset, size)
+        preset_learner = name_of(config.learner)
+        learner = _named(arguments, "--learner", LEARNERS, preset_learner)
+        if learner != preset_learner:
+            config = dataclasses.replace(config, learner=LEARNERS[learner]())
+        return cls(preset=preset, size=size, learner=learner, config=config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +83,7 @@ class Reach(ReachOptions):
     def __call__(self) -> int:
         console = start()
         if self.resume:
-            self.check_resume_alone(self.default([]))
-            return _resume(self.resume, console)
+            return _resume(self, self.resume, console)
         return _begin("reach", self, self.config, {"agent": self.agent}, console)
 
 
@@ -65,14 +107,13 @@ class Imitate(NewRunOptions):
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
-        preset = named(arguments, "--preset", IMITATION_PRESETS, "pipe")
+        preset = _named(arguments, "--preset", IMITATION_PRESETS, "pipe")
         return cls(preset=preset, config=IMITATION_PRESETS[preset])
 
     def __call__(self) -> int:
         console = start()
         if self.resume:
-            self.check_resume_alone(self.default([]))
-            return _resume(self.resume, console)
+            return _resume(self, self.resume, console)
         if self.file is None:
             raise InputError("FILE: got nothing, expected the demonstrations, or --resume RUN")
         # Settings of the learned reward, which may be another run's.
@@ -88,6 +129,18 @@ class Imitate(NewRunOptions):
         config = dataclasses.replace(self.config, learner=learner)
         donors = {"agent": self.agent, "reward": self.reward}
         return _begin("imitate", self, config, donors, console, self.file)
+
+
+def _differing(one: Any, other: Any, ignored: Sequence[str] = ()) -> list[str]:
+    names = [item.name for item in dataclasses.fields(one)]
+    return [name for name in names if name not in ignored and getattr(one, name) != getattr(other, name)]
+
+
+def _named(arguments: Sequence[str], option: str, names: Iterable[str], default: str) -> str:
+    """Return the name that an option has among the words of a command line, or the default without one."""
+    words = [part for word in arguments for part in word.split("=", 1)]
+    name = dict(itertools.pairwise(words)).get(option, default)
+    return name if name in names else default  # an unknown one is refused as all options are read
 
 
 def evaluate(
@@ -137,11 +190,12 @@ def evaluate(
         )
     # Evaluate under them.
     spec = opened.spec.replace(mass={"payload_kg": opened.spec.mass.payload_kg + 1e-3 * payload})
-    summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.arm.s2r), n_actions)(policy)
+    env = ReachEnv(spec, config, opened.arm.s2r)
+    summary, *_ = dataclasses.replace(task.evaluate, env=env, n_actions=n_actions)(policy)
     _table(f"{task.evaluate.title}, {how}", summary, console)
     file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())
-    console.print(f"written: {file}", highlight=False, soft_wrap=True)
+    console.print(f"written: {file}", soft_wrap=True)
     return 0
 
 
@@ -155,13 +209,7 @@ def _begin(
 ) -> int:
     """Make a run and train it to its end; returns the exit status.
 
-    Args:
-        command: name of the command.
-        options: its options.
-        config: settings of the run.
-        donors: folders of runs that the new one takes parts of, `agent` and `reward`.
-        console: shows progress.
-        demonstrations: file of demonstrations, if it learns from these.
+    `donors` are folders of runs that the new one takes parts of, by the options `agent` and `reward`.
     """
     # The arm, the demonstrations, and the runs that the new one begins with.
     arm = options.read_arm(console)
@@ -175,7 +223,7 @@ def _begin(
     if env.spec != arm.spec:
         n, n_specified = (spec.structure.links_per_section for spec in (env.spec, arm.spec))
         console.print(f"the arm has {n} links per section in this run, {n_specified} in its specification")
-    task = task_of(config, env, None if log is None else from_log(log, arm.spec))
+    task = runs.task_of(config, env, None if log is None else from_log(log, arm.spec))
     first = runs.begin_with(task, config.seed, opened) if opened else None
     path = options.out or runs.free_path(Path("runs") / f"{command}-{options.preset}-seed{config.seed}")
     begins_with = {name: run.path for name, run in opened.items()}
@@ -183,30 +231,31 @@ def _begin(
     return _train(run, task, console)
 
 
-def _resume(path: Path, console: Console) -> int:
+def _resume(options: Reach | Imitate, path: Path, console: Console) -> int:
+    options.check_resume_alone()
     run = Run.open(path)
     if run.checkpoints.latest is None:
         run.check_begins_anew()
-        console.print(f"{path}: no checkpoint yet, the run begins anew", highlight=False, soft_wrap=True)
+        console.print(f"{path}: no checkpoint yet, the run begins anew", soft_wrap=True)
     return _train(run, runs.task_of_run(run), console)
 
 
-def _train(run: Run, task: Task, console: Console) -> int:
-    console.print(f"run: {run.path}", highlight=False, soft_wrap=True)
+def _train(run: Run, task: runs.Task, console: Console) -> int:
+    console.print(f"run: {run.path}", soft_wrap=True)
     try:
         with sole_trainer(run.path):
             summary = runs.train(run, task, console)
     except runs.Interrupted as stop:
-        console.print(str(stop), highlight=False)
+        console.print(str(stop))
         return cli.INTERRUPTED
     _show(run, task, summary, console)
     return 0
 
 
-def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
+def _show(run: Run, task: runs.Task, summary: Any, console: Console) -> None:
     _table(f"{task.evaluate.title}, {N_ACTIONS} actions each", summary, console)
     for picture in sorted(run.path.glob("*.png")):
-        console.print(f"picture: {picture}", highlight=False, soft_wrap=True)
+        console.print(f"picture: {picture}", soft_wrap=True)
 
 
 def _table(title: str, summary: Any, console: Console) -> None:

@@ -1,6 +1,7 @@
-"""Evaluation of a policy on two sets of held-out goals over the whole workspace, and on the paper's circle.
+"""Evaluation of a policy: at held-out goals and on the paper's circle, or at demonstrated positions.
 
-The first set has random pressures and is rarely near the rim; the second is uniform in volume, rim included.
+There are two sets of held-out goals. The first has random pressures and is rarely near the rim; the second is
+uniform in volume, rim included.
 """
 
 from __future__ import annotations
@@ -8,8 +9,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -24,6 +24,7 @@ from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
+from mjx_softarm.sensing.pose import pose_error
 
 N_GOALS = 2_000
 NEAR_MM = 5.0  # tip error of an arm that has arrived, in motion
@@ -94,26 +95,38 @@ class Summary(Figures):
     near_median_s: float | None = figure("  after, in the median of all", "s", 2, default=None)
 
 
-class Evaluator:
-    """Evaluate policies of one learner on one arm without randomisation; compiled once.
+@dataclass(eq=False)
+class _Evaluator:
+    """Evaluate policies of one learner on one arm without randomisation; compiled once."""
 
-    Every goal gets `n_actions` of the deterministic policy, and the state after the last counts. Each of many
-    arms goes from goal to goal of its part of the workspace. One goes twice around the circle, and its second
-    lap counts. `shift_limit` (6,) [mm, deg] limits how goals are corrected, see `reach`.
+    env: ReachEnv
+    learner: Any
+    n_actions: int = N_ACTIONS  # actions of the deterministic policy towards each goal; the last state counts
+    shift_limit: np.ndarray = field(default_factory=lambda: UNCORRECTED)  # (6,) [mm, deg], see `reach`
+
+    def __post_init__(self) -> None:
+        self.env = nominal(self.env)
+
+    def _from_start(self, policy: Any, path: Array, key: Array) -> Reached:
+        """Return the results of one arm, from a random start, along a path (n, 6) of goals."""
+        start = self.env.reset(key)
+        return follow(self.env, self.learner, policy, path, start, self.n_actions, self.shift_limit)
+
+
+@dataclass(eq=False)
+class Evaluator(_Evaluator):
+    """Evaluate policies over the workspace and on the circle.
+
+    Each of many arms goes from goal to goal of its part of the workspace. One goes twice around the circle,
+    and its second lap counts.
     """
 
-    def __init__(
-        self,
-        env: ReachEnv,
-        learner: Any,
-        n_goals: int = N_GOALS,
-        n_actions: int = N_ACTIONS,
-        shift_limit: np.ndarray = UNCORRECTED,
-    ):
-        self.env, self.learner, self.n_goals = nominal(env), learner, n_goals
-        self.circle = np.asarray(circle_poses(env.spec))
-        go = follower(self.env, learner, n_actions, shift_limit)
-        self._follow = xla.jit(jax.vmap(go, in_axes=(None, 0, 0)))
+    n_goals: int = N_GOALS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.circle = np.asarray(circle_poses(self.env.spec))
+        self._follow = xla.jit(jax.vmap(self._from_start, in_axes=(None, 0, 0)))
 
     @property
     def title(self) -> str:
@@ -129,12 +142,6 @@ class Evaluator:
         """Both sets of held-out poses (2 n_goals, 6) [mm, deg], drawn on first use."""
         sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
         return np.concatenate([poses.pose for poses in sets])
-
-    def on(
-        self, env: ReachEnv, n_actions: int = N_ACTIONS, shift_limit: np.ndarray = UNCORRECTED
-    ) -> Evaluator:
-        """Return the same evaluation on another environment."""
-        return Evaluator(env, self.learner, self.n_goals, n_actions, shift_limit)
 
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
         """Return figures, and the results on the first set and on the circle as NumPy arrays."""
@@ -223,12 +230,9 @@ def reach(
 
 
 def time_near(way_mm: Array, goal_mm: Array, period_s: float) -> Array:
-    """Return when a tip came near its goal for good, () [s].
+    """Return when a tip came near its goal (3,) for good, () [s].
 
-    Args:
-        way_mm (t, 3): positions of the tip, a control period apart, the first where it began.
-        goal_mm (3,): the goal.
-        period_s: control period.
+    Its positions `way_mm` (t, 3) are a control period apart, the first where it began.
     """
     far = jnp.linalg.norm(way_mm - goal_mm, axis=-1) > NEAR_MM
     last_far = jnp.max(jnp.where(far, jnp.arange(1, len(way_mm) + 1), 0))
@@ -250,15 +254,6 @@ def follow(
         return reach(env, learner, policy, state, goal, n_actions, shift_limit)
 
     return jax.lax.scan(go_on, state, path)[1]
-
-
-def follower(
-    env: ReachEnv, learner: Any, n_actions: int, shift_limit: np.ndarray = UNCORRECTED
-) -> Callable[[Any, Array, Array], Reached]:
-    """Return the function of policy, path and key that follows a path from a random start."""
-    return lambda policy, path, key: follow(
-        env, learner, policy, path, env.reset(key), n_actions, shift_limit
-    )
 
 
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:
@@ -291,3 +286,89 @@ def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: flo
         circle_saturated_chambers=int(np.sum(circle.saturated_chambers)),
         **motion,
     )
+
+
+class AtPositions(NamedTuple):
+    """Results at m demonstrated positions, in their order."""
+
+    reached: Reached  # (m, ...)
+    success: np.ndarray  # (m,) bool: close enough, no chamber saturated, the body inside the pipe
+
+
+@dataclass(frozen=True)
+class PositionSummary(Figures):
+    """Figures at demonstrated positions."""
+
+    error_mm: tuple[float, ...]  # tip error at each position
+    success: tuple[bool, ...]  # of each position
+    success_share: float = figure("positions with success", "%", 1)
+    success_first_share: float = figure("positions of the first stage with success", "%", 1)
+    reached_share: float = figure("positions reached", "%", 1)  # with or without saturation and contact
+    median_mm: float = figure("tip error, median", "mm", 2)
+    max_mm: float = figure("tip error, largest", "mm", 2)
+    x_mm: float = figure("mean absolute error in x", "mm", 2)
+    y_mm: float = figure("mean absolute error in y", "mm", 2)
+    z_mm: float = figure("mean absolute error in z", "mm", 2)
+    saturated_positions: int = figure("positions with a saturated chamber", "")
+    outside_positions: int = figure("positions with the body outside the pipe", "")
+    unsettled: int = figure("arms that did not settle", "")
+
+
+@dataclass(eq=False)
+class PositionEvaluator(_Evaluator):
+    """Evaluate policies on demonstrated positions, one after another.
+
+    An action leads to the same pose from every start, so one arm goes from position to position. Its second
+    pass counts.
+    """
+
+    positions: np.ndarray = field(kw_only=True)  # (m, 6) [mm, deg], float32
+    first: np.ndarray = field(kw_only=True)  # (m,) bool: goals of the first stage
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._go = xla.jit(self._from_start)
+
+    @property
+    def title(self) -> str:
+        """Title of the table of figures."""
+        return f"{len(self.positions)} demonstrated positions"
+
+    def headline(self, row: dict[str, float]) -> str:
+        """Return a short text for a row of metrics with an evaluation."""
+        share, median_mm = row["evaluation/success_share"], row["evaluation/median_mm"]
+        return f"success at {100 * share:.0f} % of the positions, median {median_mm:.1f} mm"
+
+    def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
+        """Return figures, and results as NumPy arrays."""
+        policy, m = jax.device_get(policy), len(self.positions)  # it may be on many devices
+        passes = jax.device_get(self._go(policy, np.tile(self.positions, (2, 1)), start_keys(1)[0]))
+        second = jax.tree.map(lambda x: x[m:], passes)
+        return summarise_positions(second, self.env.config.reward.threshold, self.first)
+
+
+def summarise_positions(
+    reached: Reached, threshold: float, first: np.ndarray
+) -> tuple[PositionSummary, AtPositions]:
+    """Return the figures of results at m positions; `first` (m,) bool marks the goals of the first stage."""
+    close = reached.scaled_error < threshold  # (m,)
+    saturated, outside = reached.saturated_chambers > 0, reached.clearance_mm <= 0.0
+    success = close & ~saturated & ~outside & reached.settled
+    error_mm = reached.tip_error_mm
+    x, y, z = np.abs(pose_error(reached.pose, reached.goal))[..., :3].mean(axis=0)
+    figures = PositionSummary(
+        success_share=float(success.mean()),
+        success_first_share=float(success[first].mean()),
+        reached_share=float(close.mean()),
+        median_mm=float(np.median(error_mm)),
+        max_mm=float(error_mm.max()),
+        x_mm=float(x),
+        y_mm=float(y),
+        z_mm=float(z),
+        saturated_positions=int(np.count_nonzero(saturated)),
+        outside_positions=int(np.count_nonzero(outside)),
+        unsettled=int(np.count_nonzero(~reached.settled)),
+        error_mm=tuple(float(value) for value in error_mm),
+        success=tuple(bool(value) for value in success),
+    )
+    return figures, AtPositions(reached, np.asarray(success))

@@ -18,11 +18,9 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.files import read_json_lines, replacing
 from mjx_softarm._support.lazy import LazyModule
 from mjx_softarm._support.provenance import provenance, write_json
-from mjx_softarm.logs.files import LogError
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.sensing.s2r import S2R_FILE
 from mjx_softarm.spec import ArmSpec
-from train.agent.registry import learns_from_demonstrations
 from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
 
@@ -34,8 +32,6 @@ else:
 CONFIG_FILE, EVALUATION_FILE, METRICS_FILE = "config.json", "evaluation.json", "metrics.jsonl"
 DEMONSTRATIONS_FILE, LOCK_FILE = "demonstrations.npz", "training.lock"
 N_KEPT = 2  # checkpoints
-# Codes that begin a message of TensorStore about files that are cut, changed or absent
-_DAMAGE = ("DATA_LOSS", "OUT_OF_RANGE", "NOT_FOUND", "FAILED_PRECONDITION")
 
 
 class Checkpoints:
@@ -65,12 +61,9 @@ class Checkpoints:
             self._manager.delete(later)
 
     def save(self, epoch: int, state: Any, parts: dict[str, Any]) -> None:
-        """Write a checkpoint; an interrupted write leaves the one before it in force.
+        """Write a checkpoint of the state and of `Learner.parts`, after a number of epochs.
 
-        Args:
-            epoch: number of epochs done.
-            state: all that the run needs to go on.
-            parts: what export and other runs need of the learner; see `train.epoch.replay_epoch.Learner`.
+        An interrupted write leaves the checkpoint before it in force.
         """
         both = {"state": state, "parts": jax.device_get(parts)}
         saved = {name: ocp.args.StandardSave(item) for name, item in both.items()}
@@ -78,22 +71,18 @@ class Checkpoints:
         self._manager.wait_until_finished()
 
     def restore(self, like: Any) -> tuple[int, Any]:
-        """Return the newest checkpoint: epochs done, and state.
-
-        Args:
-            like: a state, or its shapes, structured as the run's.
+        """Return the newest checkpoint: epochs done, and state, structured as the state or shapes `like`.
 
         Raises:
-            InputError: there is no checkpoint, or it has another structure.
+            InputError: there is no checkpoint, or it cannot be read.
         """
-        shapes = ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like))
-        return self._newest("state", shapes)
+        return self._newest("state", ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like)))
 
     def parts(self) -> dict[str, Any]:
         """Return the newest checkpoint's parts of the learner as NumPy arrays; see `Learner.parts`.
 
         Raises:
-            InputError: there is no checkpoint, or it is another version's.
+            InputError: there is no checkpoint, or it cannot be read.
         """
         return self._newest("parts", ocp.args.StandardRestore())[1]
 
@@ -104,32 +93,16 @@ class Checkpoints:
             raise InputError(f"{self.run}: got no checkpoint, expected one; start the run anew")
         try:
             return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
-        except Exception as error:
+        except Exception as error:  # orbax raises many kinds
+            reason = str(error).partition("\n")[0][:200]
             folder = self.path / str(epoch)
-            if _is_damage(folder / item, error):
-                earlier = [saved for saved in self.epochs if saved < epoch]
-                remedy = f"; without {folder} the run goes back to epoch {earlier[-1]}" if earlier else ""
-                raise InputError(
-                    f"{folder / item}: got a damaged checkpoint ({str(error).splitlines()[0][:200]}), "
-                    f"expected it as it was written{remedy}"
-                ) from error
-            if not isinstance(error, (ValueError, KeyError)):
-                raise
+            earlier = [saved for saved in self.epochs if saved < epoch]
+            remedy = f", or go back to epoch {earlier[-1]} without {folder}" if earlier else ""
             raise InputError(
-                f"{self.run}: got a checkpoint of other parts or sizes, expected this version's; "
-                "continue it with the commit that its config.json names"
+                f"{folder / item}: got a damaged checkpoint, or one of other parts or sizes "
+                f"({reason}), expected this version's; "
+                f"continue with the commit that config.json names{remedy}"
             ) from error
-
-
-def _is_damage(folder: Path, error: Exception) -> bool:
-    """Return whether the files of a checkpoint's item are damaged, rather than those of another version."""
-    chain = (error, error.__cause__)  # the reading of an array fails in a thread
-    unread = isinstance(error, (UnicodeDecodeError, json.JSONDecodeError, FileNotFoundError))
-    return (
-        unread
-        or not (folder / "_METADATA").exists()
-        or any(code in str(one) for one in chain if one is not None for code in _DAMAGE)
-    )
 
 
 def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
@@ -137,12 +110,8 @@ def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
 
     Otherwise orbax restores to the devices of the saved array, which may not exist here.
     """
-    shape = ocp.utils.to_shape_dtype_struct(x)
-    assert isinstance(shape, jax.ShapeDtypeStruct)  # a state has no plain numbers
-    if shape.sharding is not None:
-        return shape
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return jax.ShapeDtypeStruct(shape.shape, shape.dtype, sharding=device)
+    return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(x, "sharding", None) or device)
 
 
 class Run:
@@ -189,7 +158,6 @@ class Run:
         Raises:
             InputError: the folder already holds a run, or cannot be made.
         """
-        # Refuse a folder with a run.
         if (path / CONFIG_FILE).exists():
             raise InputError(
                 f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"
@@ -251,14 +219,11 @@ class Run:
         """Return the demonstrations that the run learns from, or None.
 
         Raises:
-            InputError: its file cannot be read.
+            LogError: its file cannot be used.
         """
-        if not learns_from_demonstrations(self.config.learner):
+        if not self.config.learner.FROM_DEMONSTRATIONS:
             return None
-        try:
-            return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
-        except LogError as error:
-            raise InputError(str(error)) from error
+        return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
 
     def policy(self) -> Any:
         """Return the parameters of the newest checkpoint's policy; see `Checkpoints.parts`."""

@@ -10,28 +10,22 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from train.runs.evaluate import Reached
-from train.runs.positions import AtPositions
+from train.runs.evaluate import AtPositions, Reached
 
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
 DPI = 150
 STEPS = "environment steps"
 
 
-def save(folder: Path, pictures: dict[str, Figure]) -> None:
-    """Write pictures, by their names, into a folder."""
+def save(folder: Path, rows: list[dict[str, Any]], result: Reached | AtPositions, *circle: Reached) -> None:
+    """Write the pictures of a run into its folder, from its metrics and the results of its evaluation."""
+    pictures = {"learning_curve.png": learning_curve(rows)}
+    if isinstance(result, AtPositions):
+        pictures["positions.png"] = positions_figure(result)
+    else:
+        pictures |= {"circle.png": circle_figure(*circle), "workspace_error.png": workspace_figure(result)}
     for name, figure in pictures.items():
         figure.savefig(folder / name, dpi=DPI)
-
-
-def pictures(
-    rows: list[dict[str, Any]], result: Reached | AtPositions, *circle: Reached
-) -> dict[str, Figure]:
-    """Return the pictures of a run, by file name, from its metrics and the results of its evaluation."""
-    curve = {"learning_curve.png": learning_curve(rows)}
-    if isinstance(result, AtPositions):
-        return curve | {"positions.png": positions_figure(result)}
-    return curve | {"circle.png": circle_figure(*circle), "workspace_error.png": workspace_figure(result)}
 
 
 def dress(axes: Any, title: str, x: str, y: str) -> None:
@@ -54,12 +48,11 @@ def _figure(width: float, *panels: tuple[str, str, str], height: float = 4.0) ->
     return figure, figure.axes
 
 
-def logarithmic(axes: Any) -> None:
-    """Make the y axis logarithmic, with plain numbers."""
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
+def _plain_numbers(axis: Any) -> None:
+    """Label a logarithmic axis with plain numbers."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _evaluations(
@@ -89,7 +82,8 @@ def learning_curve(rows: list[dict[str, Any]]) -> Figure:
         "circle_mean_mm": (GREY, "circle, mean"),
     }
     _evaluations(left, rows, 1, errors)
-    logarithmic(left)
+    left.set_yscale("log")
+    _plain_numbers(left.yaxis)
     shares = {
         "reached_share": (BLUE, "goals reached"),
         "saturated_share": (ORANGE, "goals with a saturated chamber"),
@@ -143,9 +137,7 @@ def workspace_figure(workspace: Reached) -> Figure:
     low = float(np.clip(np.quantile(error, 0.02), max(high / 1e3, 0.01), high / 10))
     axes.set_xscale("log")
     axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    _plain_numbers(axes.xaxis)
     share = 100 * np.arange(1, len(error) + 1) / len(error)
     axes.plot(np.maximum(np.sort(error), low), share, color=BLUE)
     for percent, colour in ((50, GREY), (95, ORANGE)):

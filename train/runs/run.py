@@ -1,14 +1,13 @@
-"""Host side of a training run: loop over epochs, show, log, checkpoint, stop on request."""
+"""Host side of a training run: its task, and the loop over epochs that shows, logs, saves and stops."""
 
 from __future__ import annotations
 
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -20,13 +19,58 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from train.agent.learner import LearnerConfig
-from train.agent.registry import name_of
-from train.config import TrainConfig
-from train.epoch.job import State
+from train.config import TrainConfig, name_of
+from train.demos.demonstrations import Demonstrations
+from train.epoch.job import FreshPoses, Job, State
+from train.runs.evaluate import Evaluator, PositionEvaluator
 from train.runs.folder import EVALUATION_FILE, Run
-from train.runs.task import Task, task_of
 
-SLOW_S = 3.0  # longer work than this is announced
+
+class Task(NamedTuple):
+    """Job of a run, its evaluation, and what happens before each epoch."""
+
+    job: Job
+    evaluate: Evaluator | PositionEvaluator
+    prepare: Callable[[State, int], State]  # state, number of epochs done -> state
+
+
+def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations | None = None) -> Task:
+    """Return the task of a run: to reach the whole workspace, or positions as an expert showed.
+
+    Args:
+        config: settings of the run.
+        env: environment of its arms.
+        demonstrations: demonstrations to learn from, for a learner from demonstrations.
+
+    Raises:
+        InputError: the learner needs demonstrations and has none.
+    """
+    epoch: Any = config.learner.make_epoch(env, demonstrations)
+    if demonstrations is None:
+        job = Job(epoch, fresh_poses(config, env))
+        return Task(job, Evaluator(env, epoch.learner), lambda state, k: state)
+    positions, first = demonstrations.positions, epoch.goals.of_stage(0)
+    evaluate = PositionEvaluator(env, epoch.learner, positions=positions, first=first)
+
+    def prepare(state: State, k: int) -> State:
+        errors_mm = lambda: evaluate(epoch.learner.policy(state.learner))[0].error_mm  # noqa: E731
+        return epoch.goals.prepare(state, k, errors_mm)
+
+    return Task(Job(epoch), evaluate, prepare)
+
+
+def task_of_run(run: Run) -> Task:
+    """Return the task of a run.
+
+    Raises:
+        InputError: its demonstrations cannot be read.
+    """
+    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations())
+
+
+def fresh_poses(config: TrainConfig, env: ReachEnv) -> FreshPoses:
+    """Return the pools of poses of a run."""
+    return FreshPoses(env, config.fresh_poses_epochs, config.learner.n_epochs, config.seed)
 
 
 class Interrupted(Exception):
@@ -35,11 +79,6 @@ class Interrupted(Exception):
 
 def train(run: Run, task: Task, console: Console) -> Any:
     """Train to the end of the run's config, from its newest checkpoint if it has one.
-
-    Args:
-        run: the folder, with all settings.
-        task: task of the run.
-        console: shows progress.
 
     Returns:
         Figures of the final policy.
@@ -117,8 +156,8 @@ def train_together(
                 refuse_divergence(run.config, row["env/unsettled"])
                 member_state = member(state, k) if due or stop else None
                 if member_state is not None and due:
-                    with noted(console, "compiling the evaluation ..."):
-                        row |= evaluation(task, learner.policy(member_state.learner))
+                    figures = task.evaluate(learner.policy(member_state.learner))[0].to_dict()
+                    row |= {f"evaluation/{n}": x for n, x in figures.items() if not isinstance(x, tuple)}
                 record(run, board, epoch, row)
                 if member_state is not None:
                     run.checkpoints.save(epoch, member_state, learner.parts(member_state.learner))
@@ -128,17 +167,6 @@ def train_together(
     return [
         finish(run, task, learner.policy(member(state, k).learner)) for k, (run, task) in enumerate(members)
     ]
-
-
-@contextmanager
-def noted(console: Console, text: str) -> Iterator[None]:
-    """Print a text if the work inside takes longer than `SLOW_S`, as the first call of a program may."""
-    timer = threading.Timer(SLOW_S, console.print, [text])
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
@@ -158,17 +186,8 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     results: Any
     summary, *results = task.evaluate(policy)
     write_json(run.path / EVALUATION_FILE, summary.to_dict())
-    plots.save(run.path, plots.pictures(run.metrics(), *results))
+    plots.save(run.path, run.metrics(), *results)
     return summary
-
-
-def task_of_run(run: Run) -> Task:
-    """Return the task of a run.
-
-    Raises:
-        InputError: its demonstrations cannot be read.
-    """
-    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations())
 
 
 def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State, dict[str, Any]]:
@@ -176,7 +195,7 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State,
 
     Args:
         task: task of the new run.
-        seed: seed of the new run.
+        seed: its seed.
         donors: `agent`: run whose networks are taken; `reward`: run whose learned reward is taken.
 
     Raises:
@@ -193,7 +212,7 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State,
             state = state._replace(learner=learner.adopt(state.learner, parts))
         except ValueError as error:
             raise InputError(f"{donor.path}: {error}") from error
-    return state, task.job.parts(state)
+    return state, learner.parts(state.learner)
 
 
 def timed_epoch(job: Any, state: State, learner: LearnerConfig, epoch: int) -> tuple[State, dict[str, Any]]:
@@ -201,28 +220,20 @@ def timed_epoch(job: Any, state: State, learner: LearnerConfig, epoch: int) -> t
     start = time.perf_counter()
     state, metrics = job.epoch(state)
     metrics = jax.device_get(metrics)
-    seconds, before = time.perf_counter() - start, counts(learner, epoch)
-    done = {name: n - before[name] for name, n in counts(learner, epoch + 1).items()}
-    return state, metrics | {f"speed/{name}_per_s": n / seconds for name, n in done.items()}
-
-
-def evaluation(task: Task, policy: Any) -> dict[str, float]:
-    """Return the figures of a policy by their names in metrics."""
-    figures = task.evaluate(policy)[0].to_dict()
-    return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
-
-
-def counts(learner: LearnerConfig, epoch: int) -> dict[str, int]:
-    """Return the numbers of env steps and updates by the end of an epoch, by their names in metrics."""
-    return {"env_steps": learner.n_env_steps(epoch), "updates": learner.n_updates(epoch)}
+    seconds = time.perf_counter() - start
+    n_updates = learner.n_updates(epoch + 1) - learner.n_updates(epoch)
+    metrics["speed/env_steps_per_s"] = learner.n_env_steps(1) / seconds
+    metrics["speed/updates_per_s"] = n_updates / seconds
+    return state, metrics
 
 
 def record(run: Run, board: SummaryWriter, epoch: int, row: dict[str, float]) -> None:
     """Add a row to the run's metrics and to TensorBoard's."""
-    done = counts(run.config.learner, epoch)
-    run.log({"epoch": epoch, **done, **row})
+    learner = run.config.learner
+    env_steps = learner.n_env_steps(epoch)
+    run.log({"epoch": epoch, "env_steps": env_steps, "updates": learner.n_updates(epoch), **row})
     for name, value in row.items():
-        board.add_scalar(name, np.float32(value), done["env_steps"])
+        board.add_scalar(name, np.float32(value), env_steps)
 
 
 def _line(rows: Sequence[dict[str, float]], task: Task) -> str:
@@ -265,7 +276,7 @@ def shown_progress(
         def show(epoch: int, text: str, due: bool) -> None:
             progress.update(bar, completed=epoch, text=text)
             if due and hidden:
-                console.print(f"epoch {epoch} of {config.learner.n_epochs}: {text}", highlight=False)
+                console.print(f"epoch {epoch} of {config.learner.n_epochs}: {text}")
 
         yield show
 

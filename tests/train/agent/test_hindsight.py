@@ -1,5 +1,8 @@
 """Relabelling of what real arms did, against the environment that they did it in."""
 
+import copy
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,9 +52,7 @@ def relabelled(env, stored):
     many = jax.tree.map(lambda x: jnp.concatenate([x] * N_COPIES), stored)
 
     def of(key=0, **shares):
-        config = HindsightConfig(**shares)
-        kept = {"goal_ends": True, "senses_action": False}
-        batch = relabel(many, jax.random.key(key), config, env.scale, env.config.reward, **kept)
+        batch = relabel(many, jax.random.key(key), HindsightConfig(**shares), env)
         same = np.all(goal_of(env, batch.obs) == goal_of(env, env.observe(many.pose, many.goal)), axis=-1)
         np.testing.assert_array_equal(batch.relabelled, ~same)
         return many, batch
@@ -150,9 +151,7 @@ def test_a_later_pose_is_the_goal_reached_and_the_centre_of_half_of_those_nearby
     with_later = jax.tree.map(lambda x: jnp.concatenate([x] * N_COPIES), stored._replace(later_pose=later))
 
     def goals(**shares):
-        config = HindsightConfig(**shares)
-        kept = {"goal_ends": True, "senses_action": False}
-        batch = relabel(with_later, jax.random.key(0), config, env.scale, env.config.reward, **kept)
+        batch = relabel(with_later, jax.random.key(0), HindsightConfig(**shares), env)
         return np.asarray(goal_of(env, batch.obs)[:, :3])
 
     own, other = np.asarray(with_later.next_pose[:, :3]), np.asarray(with_later.later_pose[:, :3])
@@ -193,9 +192,11 @@ def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env
     n = len(stored.n_steps)
     before, after = jnp.full((n, 12), 2.0), jnp.full((n, 12), 3.0)
     moving = stored._replace(sensed=before, next_sensed=after)
-    config = HindsightConfig(reached_share=1.0)
-    kept = {"goal_ends": False, "senses_action": True}
-    batch = relabel(moving, jax.random.key(0), config, env.scale, env.config.reward, **kept)
+    config, key = HindsightConfig(reached_share=1.0), jax.random.key(0)
+    motion = copy.copy(env)
+    changes = {"engine": "mjx", "mode": "dynamic", "observation": "motion", "goal_ends": False}
+    motion.config = dataclasses.replace(env.config, **changes)
+    batch = relabel(moving, key, config, motion)
     np.testing.assert_array_equal(batch.obs[:, 18:], before)
     n_springs = batch.action.shape[1]
     np.testing.assert_array_equal(batch.next_obs[:, 18:-n_springs], after[:, :-n_springs])
@@ -203,7 +204,6 @@ def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env
     assert (batch.action != stored.action).any()
     assert batch.reward.max() > 50.0 and not batch.terminated.any()  # reached, and it goes on
     carrying = stored._replace(sensed=before[:, :1], next_sensed=after[:, :1])
-    kept["senses_action"] = False
-    batch = relabel(carrying, jax.random.key(0), config, env.scale, env.config.reward, **kept)
+    batch = relabel(carrying, key, config, env)
     np.testing.assert_array_equal(batch.obs[:, 18:], before[:, :1])
     np.testing.assert_array_equal(batch.next_obs[:, 18:], after[:, :1])

@@ -145,22 +145,6 @@ def test_truncated_targets_equal_loops_over_sorted_pools(strict_dtypes):
         np.testing.assert_allclose(np.sort(targets[b]), np.sort(expected), rtol=1e-5, atol=1e-6)
 
 
-def test_actor_loss_equals_loops(strict_dtypes):
-    rng = np.random.default_rng(2)
-    log_prob, quantiles, alpha = rng.normal(size=B), rng.normal(size=(B, C, M)), 0.3
-    expected = sum(alpha * log_prob[b] - sum(quantiles[b].ravel()) / (C * M) for b in range(B)) / B
-    got = tqc.actor_loss(*floats(log_prob, quantiles, alpha))
-    assert got == pytest.approx(expected, rel=1e-5)
-
-
-def test_alpha_loss_equals_loops_and_its_gradient_is_the_entropy_above_target(strict_dtypes):
-    log_prob, log_alpha, target = np.array([0.5, -1.5, 2.0, 1.0]), -0.7, -2.0
-    value, slope = jax.value_and_grad(tqc.alpha_loss)(*floats(log_alpha, log_prob), target)
-    assert value == pytest.approx(sum(-log_alpha * (p + target) for p in log_prob) / B, rel=1e-6)
-    # Entropy -0.5 is above its target -2: descending the positive slope lowers alpha.
-    assert slope == pytest.approx(-np.mean(log_prob) - target, rel=1e-6)
-
-
 def test_update_is_one_adam_step_on_each_loss_at_the_incoming_state(agent, state, update):
     batch, key = make_batch(), jax.random.key(1)
     got, metrics = update(state, batch, key)

@@ -14,6 +14,7 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from tests.arms import SHORT
 from tests.train.small import CONFIG, new_job
 from train.epoch.job import FreshPoses
+from train.runs import run
 from train.runs.folder import Run
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -114,13 +115,13 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
 
 
 def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tmp_path):
-    run, state = Run.create(tmp_path, CONFIG, CalibratedArm(job.env.spec)), start(job)
+    checkpoints, state = Run.create(tmp_path, CONFIG, CalibratedArm(job.env.spec)).checkpoints, start(job)
     with pytest.raises(InputError, match="got no checkpoint"):
-        run.checkpoints.restore(state)
-    run.checkpoints.save(0, state, job.parts(state))
+        checkpoints.restore(state)
+    checkpoints.save(0, state, job.learner.parts(state.learner))
     for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
-        with pytest.raises(InputError, match=f"{tmp_path}: got a checkpoint of other parts or sizes"):
-            run.checkpoints.restore(other)
+        with pytest.raises(InputError, match=f"{tmp_path}/.*: got .* of other parts or sizes"):
+            checkpoints.restore(other)
 
 
 POSES = EnvConfig(n_poses=32, even_share=0.5)
@@ -143,3 +144,18 @@ def test_a_pool_serves_some_epochs_and_each_run_has_its_own(pools):
     np.testing.assert_array_equal(poses[4], pools()(4).pose)  # of a run that goes on
     lasting = pools(every=0)
     assert lasting(0) is lasting(5)
+
+
+def test_success_is_of_episodes_or_of_single_actions():
+    episodes = {"env/episodes": 8.0, "env/successes": 6.0}
+    for row, text in ((episodes, "exploring: success 75 % of episodes"), ({}, "success 50 % of actions")):
+        assert run._success([row | {"env/reached": 0.5}] * 2) == text
+
+
+def test_an_epoch_in_which_most_arms_in_motion_diverge_ends_the_run_and_names_the_step():
+    moving = dataclasses.replace(CONFIG, env=EnvConfig(mode="dynamic", simulation_step_s=0.02))
+    run.refuse_divergence(moving, 8.0)
+    run.refuse_divergence(CONFIG, 16.0)  # at rest
+    message = rf"env\.simulation_step_s: got 0\.02, with which 9 of {moving.learner.n_env_steps(1)}"
+    with pytest.raises(InputError, match=message):
+        run.refuse_divergence(moving, 9.0)

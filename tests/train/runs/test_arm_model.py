@@ -7,19 +7,23 @@ import pytest
 from calib.arm import CalibratedArm
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.runs import arm_model
-from train.runs.estimator import Distilled, Error
+from train.runs.arm_model import ArmModel, DistilledArm
 
 POLICY = load_policy(SHIPPED)
 
 
-ERRORS = {"tip_mm": {0.0: Error(1.0, 2.0, 3.0)}}
+ERRORS = {"tip_mm": {"0 kg": {"median": 1.0, "p95": 2.0, "largest": 3.0}}}
 
 
 @pytest.fixture(autouse=True)
 def distilled_at_once(monkeypatch):
-    networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
-    monkeypatch.setattr(arm_model, "distil", lambda arm, seed, say: Distilled(*networks, ERRORS))
-    monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
+    model = ArmModel(*(getattr(POLICY, name) for name in ArmModel._fields))
+
+    def distil(arm, say):
+        say("distilled")
+        return DistilledArm(model, ERRORS)
+
+    monkeypatch.setattr(arm_model, "distil", distil)
     monkeypatch.setattr(arm_model, "_distilled", {})
 
 
@@ -41,7 +45,7 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
     file.write_bytes(file.read_bytes()[:-100])
     model(other)
     assert len(printed) == 3
-    monkeypatch.setattr(arm_model.estimator, "N_TRAINING", 1)
+    monkeypatch.setattr(arm_model, "N_TRAINING", 1)
     model(other)
     assert len(printed) == 4
 

@@ -13,7 +13,6 @@ from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 from tests.train.small import LEARNER
 from train.agent.analytic import AnalyticConfig
-from train.agent.registry import epoch_of
 from train.config import TrainConfig
 from train.epoch.replay_epoch import ReplayState
 from train.runs.folder import Run
@@ -59,7 +58,7 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
         "imitation": config.learner,
     }
     for name, learner_config in configs.items():
-        learner = epoch_of(learner_config, short_env, shown).learner
+        learner = learner_config.make_epoch(short_env, shown).learner
         run = Run.create(tmp_path / name, config, CalibratedArm(short_env.spec))
         with pytest.raises(InputError, match="got no checkpoint, expected one"):
             run.policy()
@@ -79,32 +78,16 @@ def saved(tmp_path):
     return run, jax.eval_shape(lambda: state)
 
 
-def cut(file):
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
-
 @pytest.mark.parametrize("item", ["parts", "state"])
 @pytest.mark.parametrize("files", ["_METADATA", "manifest.ocdbt", "**/d/*"])
-@pytest.mark.parametrize("spoil", [cut, lambda file: file.unlink()])
-def test_a_damaged_checkpoint_is_called_so(saved, item, files, spoil):
+def test_a_damaged_checkpoint_is_called_so(saved, item, files):
     run, like = saved
     folder = run.path / "checkpoints/20" / item
     for file in folder.glob(files):
-        spoil(file)
-    with pytest.raises(InputError, match=rf"{folder}: got a damaged checkpoint .*back to epoch 10"):
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match=rf"{folder}: got a damaged checkpoint.*back to epoch 10"):
         reopened = Run.open(run.path)
         reopened.checkpoints.parts() if item == "parts" else reopened.checkpoints.restore(like)
-
-
-def test_a_run_without_its_checkpoints_begins_anew_only_if_it_had_none(tmp_path):
-    run = Run.create(tmp_path, CONFIG, ARM)
-    for epoch in range(1, CONFIG.evaluation_epochs + 1):
-        run.check_begins_anew()  # it may have died before the checkpoint of the last epoch
-        run.log({"epoch": epoch})
-    run.check_begins_anew()
-    run.log({"epoch": CONFIG.evaluation_epochs + 1})
-    with pytest.raises(InputError, match="got no checkpoint of a run with 11 epochs .*another --out"):
-        run.check_begins_anew()
 
 
 def test_a_run_that_began_with_another_s_policy_does_not_begin_anew_without_it(tmp_path):

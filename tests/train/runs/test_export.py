@@ -1,16 +1,21 @@
-"""The actor alone in a file: the page's NumPy runs it, and its scales are those of training."""
+"""The actor alone in a file, whose scales are those of training; a run on a later calibration of its arm."""
 
 import dataclasses
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 from calib.arm import CalibratedArm
-from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm import ArmSpec
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.mdp.actions import SHIFT_LIMIT, ActionMap
 from mjx_softarm.mdp.observation import (
     ObsScale,
     layouts,
@@ -24,7 +29,7 @@ from mjx_softarm.policy.file import SHIPPED, load_policy
 from tests.train.small import CONFIG, SHORT
 from train.__main__ import main
 from train.agent.networks import Actor, mode
-from train.runs.export import contents, observation_scaling
+from train.runs.export import contents, observation_scaling, policy_still_accurate, renewed
 from train.runs.folder import Run
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -104,3 +109,56 @@ def test_an_estimator_that_is_not_exact_enough_is_said_to_be():
     inexact = dataclasses.replace(policy, provenance={**policy.provenance, "estimator_errors": errors})
     assert any("within 0.26 mm of the simulation, expected 0.1 mm" in line for line in contents(inexact))
     assert not any("warning" in line for line in contents(policy))
+
+
+def test_another_arm_is_refused(tmp_path):
+    run = Run.create(tmp_path / "run", CONFIG, CalibratedArm(SHORT))
+    with pytest.raises(
+        InputError, match="got an arm of 3 sections, 9 chambers and 9 springs, expected 1 sect"
+    ):
+        renewed(run, CalibratedArm(ArmSpec.default()))
+
+
+@dataclasses.dataclass
+class MadeUp:
+    """An evaluation with figures made up, and with corrected goals alone."""
+
+    figures: dict
+    shift_limit: Any = None
+
+    def __call__(self, policy):
+        np.testing.assert_array_equal(self.shift_limit, SHIFT_LIMIT)
+        return SimpleNamespace(to_dict=lambda: self.figures), None, None
+
+
+THEN = {"median_mm": 0.3, "p95_mm": 0.8}
+
+
+@pytest.mark.parametrize(
+    ("median_mm", "p95_mm", "s2r_mm", "enough"),
+    [
+        (0.68, 0.8, None, True),  # 0.98 and 0.76 mm with the models' 0.7
+        (0.72, 0.8, None, False),
+        (0.30, 1.3, 0.1, False),
+        (1.00, 0.8, 1.0, False),
+    ],
+)
+def test_training_is_needed_where_errors_grow(
+    median_mm, p95_mm, s2r_mm, enough, tmp_path, monkeypatch, capsys
+):
+    """Both evaluations are with goals that are corrected, as the loop corrects them at rest."""
+    then = Run.create(tmp_path / "then", CONFIG, CalibratedArm(SHORT), preset="payload")
+    later = None if s2r_mm is None else SimpleNamespace(error_mm=s2r_mm)
+    now = renewed(then, then.arm._replace(s2r=later))
+
+    def task_of(run):
+        figures = THEN if run is then else {"median_mm": median_mm, "p95_mm": p95_mm}
+        return SimpleNamespace(evaluate=MadeUp(figures))
+
+    monkeypatch.setattr("train.runs.run.task_of_run", task_of)
+    monkeypatch.setattr(Run, "policy", lambda run: None)
+    assert policy_still_accurate(then, now, Path("new"), Console(width=400)) == enough
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"95 %: 0.80 mm on the arm of the training, {p95_mm:.2f} mm on the later one" in said
+    command = f"python -m train reach --agent {then.path} --calibration new --preset payload"
+    assert (f"go on training: {command}" in said) != enough
