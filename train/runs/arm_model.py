@@ -73,6 +73,7 @@ from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
+N_STEPS = 5  # steps that `arm_model` reports
 SEED = 0  # seed of equilibria, initial weights, batches and the workspace; it is not that of held-out poses
 ESTIMATORS_FILE, _KIND = "estimators.npz", "estimators"
 _NAMES = "estimator", "load_estimator", "spring_model"
@@ -110,7 +111,7 @@ def arm_model(
     Args:
         arm: the arm, calibrated or not.
         folder: keeps the model in a file, which is used again for the same arm and the same code.
-        say: takes a text before each step; of none where the model is kept.
+        say: takes a text before each of `N_STEPS` steps; of none where the model is kept.
 
     Raises:
         SpecError: the arm settles at too few pressures.

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support import cli
@@ -114,7 +115,7 @@ def _export(
     """Write the policy of a run; return whether it needs no training on a later calibration."""
     from mjx_softarm.export.write import export_cpp, export_onnx
     from train.options import ArmOptions, start
-    from train.runs.arm_model import arm_model
+    from train.runs.arm_model import N_STEPS, arm_model
 
     start()
     run, file, keeps, enough = Run.open(path), out, path, True
@@ -125,7 +126,16 @@ def _export(
         enough = policy_still_accurate(run, later, calibration, console)
         run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
     # Distil the arm's networks, unless they are kept
-    arm = arm_model(run.arm, keeps, lambda step: console.print(f"{step} ..."))
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("reading the arm's networks", total=N_STEPS)
+
+        def say(step: str) -> None:
+            progress.update(bar, description=step, advance=1)
+            if not console.is_terminal:
+                console.print(f"{step} ...")
+
+        arm = arm_model(run.arm, keeps, say)
     policy = export_run(run, arm, file)
     # Say what was written
     console.print(f"policy: {policy}, {_size(policy)}")

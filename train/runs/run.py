@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -24,6 +25,8 @@ from train.demos.demonstrations import Demonstrations
 from train.epoch.job import FreshPoses, Job, State
 from train.runs.evaluate import Evaluator, PositionEvaluator
 from train.runs.folder import EVALUATION_FILE, Run
+
+SLOW_S = 3.0  # longer work than this is announced
 
 
 class Task(NamedTuple):
@@ -53,7 +56,9 @@ def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations |
     evaluate = PositionEvaluator(env, epoch.learner, positions=positions, first=first)
 
     def prepare(state: State, k: int) -> State:
-        errors_mm = lambda: evaluate(epoch.learner.policy(state.learner))[0].error_mm  # noqa: E731
+        def errors_mm() -> tuple[float, ...]:
+            return evaluate(epoch.learner.policy(state.learner))[0].error_mm
+
         return epoch.goals.prepare(state, k, errors_mm)
 
     return Task(Job(epoch), evaluate, prepare)
@@ -156,7 +161,8 @@ def train_together(
                 refuse_divergence(run.config, row["env/unsettled"])
                 member_state = member(state, k) if due or stop else None
                 if member_state is not None and due:
-                    figures = task.evaluate(learner.policy(member_state.learner))[0].to_dict()
+                    with noted(console, "compiling the evaluation ..."):
+                        figures = task.evaluate(learner.policy(member_state.learner))[0].to_dict()
                     row |= {f"evaluation/{n}": x for n, x in figures.items() if not isinstance(x, tuple)}
                 record(run, board, epoch, row)
                 if member_state is not None:
@@ -177,6 +183,17 @@ def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
             f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
             f"{n_actions} actions diverged, expected a shorter time step for this arm"
         )
+
+
+@contextmanager
+def noted(console: Console, text: str) -> Iterator[None]:
+    """Print a text if the work inside takes longer than `SLOW_S`, as the first call of a program may."""
+    timer = threading.Timer(SLOW_S, console.print, [text])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def finish(run: Run, task: Task, policy: Any) -> Any:
