@@ -6,7 +6,8 @@ The first seconds do not count: the arm's motion at the beginning is unknown, an
 
 The damping of the springs and the axial damping of the backbone stay as specified. They act in parallel with
 the chambers, which absorb their error. The bending damping of the backbone is fitted here only where
-`calib.fit.motion.shape` does not show it: the model's errors at rest are ten times as large as what it changes.
+`calib.fit.motion.shape` does not show it: on rods, whose tips are some 3 mm off at rest, this fit was off by
+half.
 """
 
 from __future__ import annotations
@@ -85,8 +86,8 @@ def fit_damping(
         stretches: parts of logs from `find_stretches`, one or more.
         spec: arm, its chambers already calibrated.
         seed: seed that chooses the held-out seconds.
-        bending_half_width: relative half-width of the 95 % interval of the backbone's damping, which stays; None
-            to fit it.
+        bending_half_width: relative half-width of the backbone's damping, which is known and stays; None to
+            fit it.
 
     Raises:
         InputError: the specified damping is zero.
