@@ -59,7 +59,7 @@ def eliminate(matrix: Array, columns: Array) -> Array:
 
 
 def _eliminate(matrix: Array, columns: Array) -> Array:
-    """Eliminate for `eliminate`, blocks of columns at once.
+    """Do the work of `eliminate`, a block of columns at a time.
 
     So each number is read and written a third as often. Barriers keep the compiler from computing the pivots'
     rows again for every other row.
