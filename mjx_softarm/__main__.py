@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mjx_softarm._support import cli
-from mjx_softarm._support.errors import InputError, needing
+from mjx_softarm._support.errors import InputError, missing, needing
 from mjx_softarm.arms import shipped_arm
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.spec import ArmSpec
@@ -129,15 +129,13 @@ def _tell_lengths(spec: ArmSpec, spring_m: np.ndarray) -> None:
     n = spec.structure.n_sections if isinstance(low_m, tuple) or isinstance(high_m, tuple) else 1
     parts = np.split(spring_m, n, axis=1)
     for k in range(n):
-        reached = np.array([parts[k].min(), parts[k].max()])
-        limits = np.array([spec.per_section(low_m)[k], spec.per_section(high_m)[k]])
-        far = np.abs(limits - reached).max() > FAR_LIMIT * np.ptp(reached)
-        (shortest, longest), (low, high) = reached, limits
+        shortest, longest = parts[k].min(), parts[k].max()
+        low, high = spec.per_section(low_m)[k], spec.per_section(high_m)[k]
+        far = max(abs(low - shortest), abs(high - longest)) > FAR_LIMIT * (longest - shortest)
         print(
-            f"springs{f' of section {k}' * (n > 1)}: springs.length_min_m = {shortest:.3f} and "
+            f"springs{f' of section {k}' if n > 1 else ''}: springs.length_min_m = {shortest:.3f} and "
             f"length_max_m = {longest:.3f} would hold what they reach; now {low:.3f} and {high:.3f}"
-            + ": change them"
-            * bool(far)
+            f"{': change them' if far else ''}"
         )
 
 
@@ -170,8 +168,7 @@ def _import_mujoco() -> None:
     try:
         import mujoco  # noqa: F401
     except ModuleNotFoundError as error:
-        with needing("sim", "drawing"):
-            raise error
+        raise InputError(f"drawing: {missing(error, 'sim')}") from error
     except (ImportError, AttributeError, RuntimeError) as error:
         asked = os.environ.get("MUJOCO_GL", "")
         raise InputError(

@@ -16,7 +16,7 @@ from mjx_softarm.policy.file import ArmModel
 from mjx_softarm.sensing.estimator import SpringModel
 from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
-from tests.arms import FOUR_CHAMBERS, OTHER_ARMS
+from tests.arms import OTHER_ARMS
 from tests.linear_arm import even_estimator
 from tests.networks import s2r_of
 
@@ -47,12 +47,6 @@ def strict():
 @pytest.fixture(scope="session")
 def spec():
     return ArmSpec.default()
-
-
-@pytest.fixture(scope="session")
-def four_chamber_arm():
-    """Four chambers a section, a spring beside each."""
-    return FOUR_CHAMBERS
 
 
 @pytest.fixture(scope="session", params=OTHER_ARMS)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 
 from mjx_softarm import ArmSpec
@@ -115,55 +116,50 @@ def load_estimator_of(spec, effect_kpa_per_kg, sd_kg=0.05):
     effect, slope = np.asarray(effect_kpa_per_kg, float), np.linalg.pinv(gain_of(spec)).T
     n_out, shares = 2 * spec.n_chambers + n_sections, np.zeros(n_sections)
     covariance = np.tile(sd_kg**2 * (effect**2).sum() * np.eye(c), (n_sections, 1, 1))
-    fields = {
-        "slope": np.concatenate([slope, np.zeros((n, n_out - spec.n_chambers))], axis=1),
-        "spring_centre_m": spec.at_springs(spec.geometry.section_length_m),
-        "spring_scale_m": np.ones(n),
-        "out_centre": np.concatenate([np.zeros(spec.n_chambers), effect, shares]),
-        "out_scale": np.ones(n_out),
-        "covariance_kpa2": covariance,
-        "error_kpa2": 0.0 * covariance,
-        "hysteresis_kpa": np.zeros(spec.n_chambers),
-        "stroke_m": np.ones(spec.n_chambers),
-        "own_load_kg": 0.0,
-        "load_scale_kg": 1.0,
-        "factor_sd": COMMON_FACTOR,
-    }
-    layers = ((np.zeros((n, n_out), np.float32), np.zeros(n_out, np.float32)),)
-    return LoadEstimator(layers, **{name: np.float32(value) for name, value in fields.items()})
+    estimator = LoadEstimator(
+        layers=((np.zeros((n, n_out)), np.zeros(n_out)),),
+        slope=np.concatenate([slope, np.zeros((n, n_out - spec.n_chambers))], axis=1),
+        spring_centre_m=spec.at_springs(spec.geometry.section_length_m),
+        spring_scale_m=np.ones(n),
+        out_centre=np.concatenate([np.zeros(spec.n_chambers), effect, shares]),
+        out_scale=np.ones(n_out),
+        covariance_kpa2=covariance,
+        error_kpa2=0.0 * covariance,
+        hysteresis_kpa=np.zeros(spec.n_chambers),
+        stroke_m=np.ones(spec.n_chambers),
+        own_load_kg=0.0,
+        load_scale_kg=1.0,
+        factor_sd=COMMON_FACTOR,
+    )
+    return jax.tree.map(np.float32, estimator)
 
 
 def even_estimator(site_m):
     """An estimator of sections that bend evenly, with springs in holes (n_sections, s, 2) [m]."""
     n_sections = len(site_m)
-    fields = {
-        "coefficient": np.zeros((n_sections, N_TERMS, N_CHANGES)),
-        "variable_centre": np.zeros((n_sections, N_VARIABLES)),
-        "variable_scale": np.full((n_sections, N_VARIABLES), VARIABLE_RANGE),
-        "spring_site_m": site_m,
-        "section_mass_kg": np.full(n_sections, 0.1),
-        "gripper_mass_kg": 0.1,
-        "tool_offset_m": np.array([0.05, 0.1]),
-        "base_position_m": np.zeros(3),
-        "base_rotation": np.eye(3),
-        "tip_offset_m": np.zeros(3),
-        "tip_rotation": np.eye(3),
-    }
-    return PoseEstimator(**{name: np.asarray(value, np.float32) for name, value in fields.items()})
+    estimator = PoseEstimator(
+        coefficient=np.zeros((n_sections, N_TERMS, N_CHANGES)),
+        variable_centre=np.zeros((n_sections, N_VARIABLES)),
+        variable_scale=np.full((n_sections, N_VARIABLES), VARIABLE_RANGE),
+        spring_site_m=site_m,
+        section_mass_kg=np.full(n_sections, 0.1),
+        gripper_mass_kg=0.1,
+        tool_offset_m=np.array([0.05, 0.1]),
+        base_position_m=np.zeros(3),
+        base_rotation=np.eye(3),
+        tip_offset_m=np.zeros(3),
+        tip_rotation=np.eye(3),
+    )
+    return jax.tree.map(np.float32, estimator)
 
 
 def changed(estimator, change, factors=(), sections=slice(None)):
     """The estimator whose sections' ends change (N_CHANGES,) for each product of 1 of these variables."""
     coefficient = estimator.coefficient.copy()
-    coefficient[sections, term(*factors)] += np.multiply(change, VARIABLE_RANGE ** len(factors))
+    primes = np.array([2.0, 3, 5, 7, 11, 13, 17, 19, 23, 29])  # a product of them has one place
+    [term] = np.flatnonzero(polynomial_terms(primes) == np.prod(primes[list(factors)]))
+    coefficient[sections, term] += np.multiply(change, VARIABLE_RANGE ** len(factors))
     return estimator._replace(coefficient=coefficient.astype(estimator.coefficient.dtype))
-
-
-def term(*factors):
-    """The place of a product of variables in the polynomial: primes have one product of a size."""
-    primes = np.array([2.0, 3, 5, 7, 11, 13, 17, 19, 23, 29])
-    [place] = np.flatnonzero(polynomial_terms(primes) == np.prod(primes[list(factors)]))
-    return place
 
 
 def make_policy(spec=SPEC):
@@ -202,12 +198,9 @@ def make_policy(spec=SPEC):
     )
 
 
-def moves_aside(policy, aside_m=0.5):
-    """The policy of an arm whose tip moves aside as its last spring gets longer, which no even bend explains.
-
-    A payload of 1 kg doubles it.
-    """
-    aside = np.array([3.0 * aside_m, 0, 0, 0, 0, 0])  # its section is a third of that longer
+def moves_aside(policy):
+    """A policy whose tip moves aside, twice as far with 1 kg, as its last spring gets longer."""
+    aside = np.array([1.5, 0, 0, 0, 0, 0])
     estimator = changed(policy.estimator, aside, (LENGTH,), sections=slice(-1, None))
     estimator = changed(estimator, aside, (LENGTH, LOAD), sections=slice(-1, None))
     return dataclasses.replace(policy, estimator=estimator)

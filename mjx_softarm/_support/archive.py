@@ -35,12 +35,7 @@ class SealedFileError(InputError):
 
 
 def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
-    """Write arrays whole or not at all; the same arrays give the same bytes.
-
-    Args:
-        path: the file; an older file of this name stays until the new one is complete.
-        arrays: arrays by name.
-        kind: kind of file, one word.
+    """Write arrays by name, whole or not at all; the same arrays give the same bytes.
 
     Raises:
         SealedFileError: the file cannot be written.
@@ -53,12 +48,7 @@ def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
 
 
 def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
-    """Read the arrays of a file that `write_sealed` wrote.
-
-    Args:
-        path: the file.
-        kind: kind that the file must have.
-        made_by: the command that makes such files, for messages.
+    """Read the arrays of a file of `write_sealed`; `made_by` is the command that makes such files.
 
     Raises:
         SealedFileError: the file cannot be read, is incomplete, damaged or of another kind.
@@ -99,23 +89,12 @@ def _mark(kind: str) -> bytes:
 
 
 def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
-    """Return the entries of a dataclass or named tuple: `name.field`.
-
-    Each layer of the field `layers` has entries `name.<k>...`, each layer of `x_layers` has `name.x.<k>...`.
-    """
+    """Return the entries `name.field` of a dataclass or named tuple; a field `layers` has `layer_entries`."""
     entries: dict[str, Any] = {}
     for item in _field_names(type(group)):
         value = getattr(group, item)
-        if item.endswith("layers"):
-            entries |= layer_entries(_network_name(name, item), value)
-        else:
-            entries[f"{name}.{item}"] = value
+        entries |= layer_entries(name, value) if item == "layers" else {f"{name}.{item}": value}
     return {item: np.asarray(value) for item, value in entries.items()}
-
-
-def _network_name(name: str, item: str) -> str:
-    """Return the name of the layers of a field `layers` or `x_layers`."""
-    return f"{name}.{item.removesuffix('layers')}".rstrip("._")
 
 
 def _field_names(kind: type) -> tuple[str, ...]:
@@ -138,9 +117,6 @@ class Entries:
 
     def __init__(self, arrays: Mapping[str, np.ndarray], source: str):
         self._source, self._arrays, self._left = source, arrays, set(arrays)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._arrays
 
     def fail(self, name: str, problem: str) -> NoReturn:
         raise SealedFileError(f"{self._source}: {name}: {problem}")
@@ -186,23 +162,19 @@ class Entries:
         return tuple(layers)
 
     def network(
-        self, name: str, kind: type, widths: Mapping[str, tuple[int, int]], **shapes: tuple[int | None, ...]
+        self, name: str, kind: type, layers: tuple[int, int] | None = None, **shapes: tuple[int | None, ...]
     ) -> Any:
-        """Return a named tuple of networks and of float32 arrays, as `entries_of` stored it.
+        """Return a named tuple of float32 arrays and, with numbers of inputs and outputs, of `layers`.
 
-        Args:
-            name: name of the group.
-            kind: class of the tuple.
-            widths: numbers of inputs and outputs of each field `layers` or `x_layers`.
-            shapes: shape of each other field; numbers of a field with `_scale` in its name must be > 0.
+        Numbers of a field with `_scale` in its name must be > 0.
         """
         values: dict[str, Any] = {}
         for item, shape in shapes.items():
             value = values[item] = np.asarray(self.take(f"{name}.{item}", np.float32, shape), np.float32)
             if "_scale" in item and not (value > 0.0).all():
                 self.fail(f"{name}.{item}", f"got {value.tolist()}, expected numbers > 0")
-        for item, (n_inputs, n_outputs) in widths.items():
-            values[item] = self.layers(_network_name(name, item), n_inputs, n_outputs)
+        if layers is not None:
+            values["layers"] = self.layers(name, *layers)
         return kind(**values)
 
     def finish(self, schema: int) -> None:

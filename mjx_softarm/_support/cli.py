@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import ast
 import functools
-import importlib
 import importlib.util
 import inspect
 import itertools
 import os
+import pkgutil
 import select
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -55,32 +55,29 @@ def main(
     words = sys.argv[1:] if arguments is None else list(arguments)
 
     def run() -> int:
-        # List the commands where the words name none, or a group such as `demos`.
+        for name, command in commands.items():
+            n_words = len(name.split())
+            if words[:n_words] == name.split():
+                function = pkgutil.resolve_name(command) if isinstance(command, str) else command
+                return finish(name, parse(function, f"{prog} {name}", words[n_words:])())
+        # List all commands, or those of a group such as `demos`.
         group = list(itertools.takewhile(lambda word: word not in ("-h", "--help"), words))
-        shown = [
-            name for name in commands if (parts := name.split()) != group and parts[: len(group)] == group
-        ]
-        if shown:
-            width = max(map(len, shown))
-            lines = [f"  {name:{width}}  {_line(commands[name])}" for name in shown]
-            print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
-            return 0
-        # Run the command.
-        name, command = read(prog, commands, words)
-        return finish(name, command())
+        shown = [name for name in commands if name.split()[: len(group)] == group]
+        if not shown:
+            raise InputError(f"{prog}: got {' '.join(group)!r}, expected one of {', '.join(commands)}")
+        width = max(map(len, shown))
+        lines = [f"  {name:{width}}  {_line(commands[name])}" for name in shown]
+        print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
+        return 0
 
     return guarded(run)
 
 
 def guarded(run: Callable[[], int]) -> int:
-    """Run a command.
+    """Run a command and return its exit status.
 
-    Args:
-        run: the command; returns its exit status.
-
-    Returns:
-        Its exit status; 2 after an error that its user can put right, 130 after Ctrl-C, and 141 where the
-        reader of its output has ended, as `head` does. Such a command ends quietly.
+    It is 2 after an error that the user can put right, 130 after Ctrl-C, and 141 where the reader of the
+    output has ended, as `head` does. Such a command ends quietly.
     """
     try:
         status = _status(run)
@@ -125,22 +122,6 @@ def _is_unread() -> bool:
     return bool(poll.poll(0))
 
 
-def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tuple[str, Callable[[], Any]]:
-    """Return the name of the command that the words begin with, and the command with its options.
-
-    Raises:
-        InputError: there is no such command, or its options do not go together.
-        SystemExit: tyro has printed help, or which option is wrong.
-    """
-    name = next((name for name in commands if list(words[: len(name.split())]) == name.split()), None)
-    if name is None:
-        first, *rest = words
-        if group := [name.removeprefix(f"{first} ") for name in commands if name.startswith(f"{first} ")]:
-            prog, first, commands = f"{prog} {first}", rest[0], dict.fromkeys(group, "")
-        raise InputError(f"{prog}: got {first!r}, expected one of {', '.join(commands)}")
-    return name, parse(_load(commands[name]), f"{prog} {name}", words[len(name.split()) :])
-
-
 def _line(command: Command) -> str:
     """Return the first line of a command's docstring."""
     if isinstance(command, str):  # read from the file, because an import may take seconds
@@ -155,15 +136,8 @@ def _line(command: Command) -> str:
     return (text or "").partition("\n")[0]
 
 
-def _load(command: Command) -> Callable[..., Any]:
-    if not isinstance(command, str):
-        return command
-    module, _, name = command.partition(":")
-    return getattr(importlib.import_module(module), name)
-
-
 def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any]:
-    """Read the options of a command.
+    """Read the options of a command, and return the command with them, to be called.
 
     Args:
         command: a function or a dataclass. A dataclass may have a classmethod `default`, which makes the
@@ -171,15 +145,18 @@ def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any
         prog: the command as its user calls it.
         arguments: words of the command line after the command.
 
-    Returns:
-        The command with its options, to be called.
-
     Raises:
         InputError: a dataclass refuses its values.
         SystemExit: tyro has printed help, or which option is wrong.
     """
     begin_with = {"default": command.default(arguments)} if hasattr(command, "default") else {}
-    kind = command if inspect.isclass(command) else _later(command)
+
+    # Options of a function are bound without a call, so that a bug is not taken for a bad option.
+    @functools.wraps(command, updated=())
+    def bind(*args: Any, **options: Any) -> Callable[[], Any]:
+        return functools.partial(command, *args, **options)
+
+    kind = command if inspect.isclass(command) else bind
     # Settings may begin as true: both forms then stand beside the text, --x and --no-x. A function's flags
     # all begin as false, and need one form.
     flags = () if inspect.isclass(command) else (tyro.conf.FlagCreatePairsOff,)
@@ -189,16 +166,6 @@ def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any
         )
     except ValueError as error:
         raise InputError(str(error)) from error
-
-
-def _later(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
-    """Return a function that binds options without a call, so that a bug is not taken for a bad option."""
-
-    @functools.wraps(function)
-    def bind(*args: Any, **options: Any) -> Callable[[], Any]:
-        return functools.partial(function, *args, **options)
-
-    return bind
 
 
 def _integers(words: list[str]) -> tuple[int, ...]:

@@ -14,12 +14,9 @@ class InputError(ValueError):
 
 
 def check_settings(where: str, settings: Any, required: Mapping[str, tuple[Any, str]]) -> None:
-    """Raise InputError where a setting does not hold.
+    """Raise InputError for the first setting in `required` (name -> holds, expected) that does not hold.
 
-    Args:
-        where: path or class of the settings.
-        settings: an object with the settings.
-        required: name -> whether the setting can be used, and what is expected of it.
+    The message begins with `where`, the path or class of the settings.
     """
     for name, (holds, expected) in required.items():
         if not holds:

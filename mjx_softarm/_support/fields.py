@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
@@ -55,13 +56,9 @@ class Rule:
             return isinstance(value, str)
         if isinstance(value, bool) or not isinstance(value, (int, self.kind)):
             return False
-        try:
-            value = float(value)
-        except OverflowError:
-            return False
         above = value > self.low if self.low_open else value >= self.low
         below = value < self.high if self.high_open else value <= self.high
-        return math.isfinite(value) and above and below
+        return above and below and abs(value) <= sys.float_info.max  # not NaN, nor a huge whole number
 
 
 # Types of settings with their ranges, for `check_ranges`
@@ -75,14 +72,11 @@ PositiveShare = Annotated[float, Rule(low=0.0, high=1.0, low_open=True)]
 
 
 def check_ranges(where: str, settings: Any) -> None:
-    """Refuse a setting of a dataclass outside the range, or the names, of its type.
+    """Raise InputError for a setting outside the range, or the names, of its type.
 
     Args:
         where: path or class of the settings with a dot at its end, or empty, for the message.
         settings: dataclass whose fields have types such as `Count` or `Literal`; None has no range.
-
-    Raises:
-        InputError: a setting is outside.
     """
     hints = typing.get_type_hints(type(settings), include_extras=True)
     for item in fields(settings):
@@ -165,9 +159,9 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
     for item in fields(cls):
         path = prefix + item.name
         group: Any = hints[item.name] if dataclasses.is_dataclass(hints[item.name]) else None
-        if item.name not in data and has_default(item):
-            continue
         if item.name not in data:
+            if item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING:
+                continue
             expected = "a table" if group else rule_of(item).text
             raise SpecError(f"{source}: {path}: got nothing, expected {expected}")
         value = data[item.name]
@@ -185,16 +179,13 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
 
 
 def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -> None:
-    """Refuse a list whose length is not the number of the arm's parts that it describes.
+    """Raise SpecError for a list whose length is not the number of the arm's parts that it describes.
 
     Args:
         table: a dataclass whose fields have rules, or are such dataclasses.
         counts: numbers of the arm's parts, such as chambers, by their names in rules.
         source: file or code of the numbers, for the message.
         prefix: name of the table in its source, with a dot at its end, or empty.
-
-    Raises:
-        SpecError: a list is too short or too long.
     """
     for item in fields(table):
         value, rule = getattr(table, item.name), rule_of(item)
@@ -215,20 +206,15 @@ def rule_of(item: dataclasses.Field) -> Rule:
     return item.metadata.get("rule", Rule(kind=str))
 
 
-def has_default(item: dataclasses.Field) -> bool:
-    """Return whether a field may be missing."""
-    return any(x is not dataclasses.MISSING for x in (item.default, item.default_factory))
-
-
 def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
     many = isinstance(value, (list, tuple)) and (rule.per or rule.length is not None)
     items: Any = value if many else [value]
     if rule.length is not None and not (many and len(value) == (rule.length or len(value))):
         raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
-    if (bad := [k for k, item in enumerate(items) if not rule.accepts(item)]) and many:
-        raise SpecError(f"{source}: {path}[{bad[0]}]: got {items[bad[0]]}, expected {rule.text}")
-    if bad:
-        raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
+    for k, item in enumerate(items):
+        if not rule.accepts(item):
+            place = f"{path}[{k}]" if many else path
+            raise SpecError(f"{source}: {place}: got {item!r}, expected {rule.text}")
     if rule.kind is float and not all(x == 0.0 or FLOAT32_MIN <= abs(x) <= FLOAT32_MAX for x in items):
         sizes = f"sizes from {FLOAT32_MIN:.2g} to {FLOAT32_MAX:.2g}, which float32 holds"
         raise SpecError(f"{source}: {path}: got {value!r}, expected {sizes}")

@@ -1,8 +1,7 @@
 """Modules that are imported when they are first used, so that commands without them begin quickly.
 
 MuJoCo and MJX take more than a second, and calibration seldom needs them. `mujoco.mjx`, which brax imports,
-prints two lines at import if warp is not installed. Nothing here needs it, so these lines are held
-back. MJX has not enough types to be checked.
+prints two lines at import if warp is not installed. Nothing needs it, so these lines are held back.
 """
 
 from __future__ import annotations

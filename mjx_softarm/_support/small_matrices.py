@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from mjx_softarm._support.xla import rows_last
+
 BLOCK = 3  # pivots that are eliminated at once
 WRITTEN_OUT = 4  # largest number of terms that a product without arms adds one by one, which is faster
 
@@ -53,39 +55,26 @@ def eliminate(matrix: Array, columns: Array) -> Array:
         (n, k, *arms), all NaN if a pivot is not positive. A symmetric matrix that is not positive definite
         has such a pivot.
     """
-    if matrix.ndim == 2:
-        return _eliminate_one(matrix, columns)
-    return _eliminate_last(jnp.concatenate([matrix, columns], axis=1))
+    return _eliminate_one(matrix, columns) if matrix.ndim == 2 else _eliminate(matrix, columns)
 
 
-@jax.custom_batching.custom_vmap
-def _eliminate_one(matrix: Array, columns: Array) -> Array:
-    return _eliminate_last(jnp.concatenate([matrix, columns], axis=1)[..., None])[..., 0]
+def _eliminate(matrix: Array, columns: Array) -> Array:
+    """Do the work of `eliminate`, a block of columns at a time.
 
-
-@_eliminate_one.def_vmap
-def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) -> tuple[Array, bool]:
-    parts = [
-        jnp.moveaxis(part, 0, -1) if own else jnp.broadcast_to(part[..., None], (*part.shape, n))
-        for part, own in zip((matrix, columns), batched, strict=True)
-    ]
-    return jnp.moveaxis(_eliminate_last(jnp.concatenate(parts, axis=1)), -1, 0), True
-
-
-def _eliminate_last(augmented: Array) -> Array:
-    """Eliminate in matrices beside columns (n, n + k, *arms).
-
-    Each step clears a block of columns, so that each number is read and written a third as often. Barriers
-    keep the compiler from computing the pivots' rows again for every other row.
+    So each number is read and written a third as often. Barriers keep the compiler from computing the pivots'
+    rows again for every other row.
     """
-    n = augmented.shape[0]
-    augmented = jax.lax.optimization_barrier(augmented)
+    n = len(matrix)
+    augmented = jax.lax.optimization_barrier(jnp.concatenate([matrix, columns], axis=1))
     for first in range(0, n, BLOCK):
         block = slice(first, min(first + BLOCK, n))
         rows = product(_inverse_last(augmented[block, block]), augmented[block])
         rows = jax.lax.optimization_barrier(rows)
         augmented = (augmented - product(augmented[:, block], rows)).at[block].set(rows)
     return augmented[:, n:]
+
+
+_eliminate_one = rows_last(_eliminate)  # `jax.vmap` of it has the arms last
 
 
 def _inverse_last(matrix: Array) -> Array:

@@ -50,9 +50,9 @@ def train_network(
 
     Args:
         loss: mean loss () of weights on some rows.
-        weights: weights to start from, a tree of arrays.
+        weights: weights to start from.
         rows: data, a tree of arrays (n, ...).
-        schedule: number of updates, learning rate, batch size and weight decay.
+        schedule: course of the training.
         key: key of the order of the rows.
         stop (n,) bool: rows that stop the training early and are not learned from; by default every tenth.
 

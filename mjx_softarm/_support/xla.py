@@ -49,39 +49,26 @@ def compiler_options(kind: Kind = "arm") -> dict[str, Any]:
 
 
 def jit(function: Callable, kind: Kind = "arm", **kwargs: Any) -> Callable:
-    """Compile with `jax.jit` and this platform's options; JAX raises inside a function that it traces.
+    """Compile with `jax.jit`, its further arguments and this platform's options.
 
-    Args:
-        function: function to compile.
-        kind: "networks" for programs that mostly train networks, without MJX; "once" for programs that run
-            once; "arm" for all others.
-        **kwargs: further arguments of `jax.jit`.
-    """
-    return jax.jit(_in_one_context(function), compiler_options=compiler_options(kind), **kwargs)
-
-
-def _in_one_context(function: Callable) -> Callable:
-    """Return the function, traced with the current mesh set explicitly.
-
-    Where there is none, JAX sets an empty one while it applies custom rules of derivatives. Its cache of
-    traces takes the two for different, and would trace helpers twice.
+    `kind` is "networks" for programs that mostly train networks, without MJX, "once" for programs that run
+    once, and "arm" for all others.
     """
 
+    # Set the current mesh. Where there is none, JAX sets an empty one while it applies custom rules of
+    # derivatives. Its cache of traces takes the two for different, and would trace helpers twice.
     @functools.wraps(function)
     def traced(*args: Any, **kwargs: Any) -> Any:
         with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
             return function(*args, **kwargs)
 
-    return traced
+    return jax.jit(traced, compiler_options=compiler_options(kind), **kwargs)
 
 
 def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:
-    """Return the results of a compiled function for all rows, as NumPy arrays, from batches of one size.
+    """Return a compiled function's results for rows (n, ...), as NumPy arrays, from batches (size, ...).
 
-    Args:
-        function: maps a tree of arrays (size, ...) to another.
-        size: rows of a batch; the last batch repeats the first rows.
-        rows: a tree of arrays (n, ...), n at least 1; they become float32.
+    Rows are a tree of arrays, n at least 1, that become float32. The last batch repeats the first rows.
     """
     n = len(jax.tree.leaves(rows)[0])
     padded = jax.tree.map(lambda x: np.resize(np.float32(x), (-(-n // size) * size, *x.shape[1:])), rows)

@@ -1,7 +1,4 @@
-"""Checks of the rows of a log.
-
-Detectors take arrays and return a mask of the faulty rows; they know nothing about files.
-"""
+"""Checks of the rows of a log: detectors take arrays, and return a mask of the faulty rows."""
 
 from __future__ import annotations
 
@@ -63,14 +60,11 @@ def not_unit_rows(quaternion: np.ndarray) -> np.ndarray:
 
 
 def turned_rows(quaternion: np.ndarray) -> np.ndarray:
-    """Mask (n,) the rows where motion capture has a body turned by 180 degrees.
+    """Mask (n,) the rows where motion capture has a body turned by 180 degrees, by unit quaternions (n, 4).
 
     Motion capture confuses the markers of a symmetric body for some rows, then jumps back. Of the two
-    orientations, the one with fewer rows counts as turned. Rows that are separate poses, not one motion,
-    cannot be checked: none counts as turned.
-
-    Args:
-        quaternion (n, 4): unit, scalar first or last.
+    orientations, the one with fewer rows counts as turned. Rows of separate poses cannot be checked: none
+    counts as turned.
     """
     cos_half = np.abs((quaternion[1:] * quaternion[:-1]).sum(axis=1))
     step_deg = 2.0 * np.degrees(np.arccos(np.minimum(cos_half, 1.0)))
@@ -84,8 +78,7 @@ def turned_rows(quaternion: np.ndarray) -> np.ndarray:
 def same_sign(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Choose the signs of quaternions (n, 4) so that neighbours are alike; q and -q are one rotation.
 
-    Returns:
-        The quaternions, and a mask (n,) of the rows where only the sign jumped: q followed about -q.
+    The mask (n,) marks the rows where only the sign jumped: q followed about -q.
     """
     cos_half = (quaternion[1:] * quaternion[:-1]).sum(axis=1)
     sign = np.cumprod(np.where(cos_half < 0.0, -1.0, 1.0))

@@ -1,7 +1,6 @@
-"""Log files as matrices: the columns that the schema knows, in internal units; rows are not checked yet.
+"""Log files as matrices: the columns that the schema knows, in internal units.
 
-All readers of logs use this module. It refuses a file that cannot be understood, with a line for each column
-that is missing, repeated or has a wrong unit. Each reader decides which rows to believe.
+A file that cannot be understood is refused. Each reader decides which rows to believe.
 """
 
 from __future__ import annotations
@@ -157,9 +156,11 @@ def _absent(
 
 def check_file(option: str, path: Path | None, endings: Sequence[str] = TABLES) -> None:
     """Refuse a file that could not be written, or whose ending names another format, before the arm moves."""
-    if path is not None and path.suffix and path.suffix not in endings:
+    if path is None:
+        return
+    if path.suffix and path.suffix not in endings:
         raise InputError(f"{option}: got {path}, expected a name that ends in {' or '.join(endings)}")
-    if path is not None and not path.parent.is_dir():
+    if not path.parent.is_dir():
         raise InputError(f"{option}: got {path}, expected a file in a folder that exists")
-    if path is not None and path.is_dir():
+    if path.is_dir():
         raise InputError(f"{option}: got {path}, a folder, expected a file")

@@ -14,6 +14,8 @@ long hold weighs no more than a short one.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 NEEDED = ("time_s", "payload_kg", "pressure_kpa", "tip_m", "tip_quaternion")  # finite in a row, where logged
@@ -29,27 +31,14 @@ ROUNDING_S = 1e-6  # error of logged times
 def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) -> list[tuple[int, int]]:
     """Return first row, and row after the last, of each stretch at constant pressures and payload.
 
-    Args:
-        time_s (n,): times of the rows.
-        pressure_kpa (n, n_chambers): commanded pressures.
-        payload_kg (n,): payload.
+    Each row has a time (n,), commanded pressures (n, n_chambers) and a payload (n,).
     """
-    n, start, spans = len(time_s), 0, []
-    breaks = np.flatnonzero((np.diff(time_s) > MIN_HOLD_S) | (np.diff(payload_kg) != 0)) + 1
-    while start < n:
-        later = breaks[np.searchsorted(breaks, start, side="right") :]
-        end = int(later[0]) if len(later) else n
-        stop, width = start + 1, 64
-        while stop < end:  # look ahead, twice as far each time
-            ahead = pressure_kpa[stop : min(stop + width, end)]
-            left = leaves(ahead, pressure_kpa[start])
-            stop += int(np.argmax(left)) if left.any() else len(left)
-            if left.any():
-                break
-            width *= 2
-        spans.append((start, stop))
-        start = stop
-    return spans
+    breaks = np.concatenate([[True], (np.diff(time_s) > MIN_HOLD_S) | (np.diff(payload_kg) != 0)])
+    starts = []
+    for row in range(len(time_s)):
+        if breaks[row] or leaves(pressure_kpa[row], pressure_kpa[starts[-1]]):
+            starts.append(row)
+    return list(itertools.pairwise([*starts, len(time_s)]))
 
 
 def leaves(pressure_kpa: np.ndarray, first_kpa: np.ndarray) -> np.ndarray:

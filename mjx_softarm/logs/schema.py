@@ -1,8 +1,7 @@
 """Logs of an arm: one table of columns with units, written by the control loop and read by `calib`.
 
 A log is a CSV file whose header names each column with its unit, `pressure0 [kPa]`, or an npz file with
-`columns` (k,) of text and `table` (n, k) of float64. Only this module defines the columns and the units that
-a file may use. `mjx_softarm.logs.files` reads logs.
+`columns` (k,) of text and `table` (n, k) of float64.
 """
 
 from __future__ import annotations
@@ -112,8 +111,8 @@ class Log:
             LogError: the readings are of another kind of sensor.
         """
         if self.readings is not None and self.reading_name != sensor.reading_name:
-            expected = f"{sensor.reading_name} of a {sensor.kind}"
-            problem = f"got readings of {self.reading_name}, expected {expected}"
+            expected = f"expected {sensor.reading_name} of a {sensor.kind}"
+            problem = f"got readings of {self.reading_name}, {expected}"
             raise LogError([Finding(self.source, None, f"{self.reading_name}0", problem)])
         return self.readings
 
@@ -143,11 +142,7 @@ def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
 
 
 def write_log(path: str | Path, log: Log) -> None:
-    """Write a log as CSV, or as npz by the suffix of the name; whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write a log as CSV, or as npz by the suffix of the name; whole or not at all."""
     path = Path(path)
     columns, table = log_table(log)
     headers = [column.header for column in columns]

@@ -24,12 +24,9 @@ class Table(NamedTuple):
 
 
 def read_table(path: str | Path) -> Table:
-    """Read a CSV file, or an npz file as `mjx_softarm.logs.schema` describes it.
+    """Read a CSV file, or an npz file (suffix `.npz`) as `mjx_softarm.logs.schema` describes it.
 
     A number that float32 cannot hold becomes infinite, which the readers of logs refuse.
-
-    Args:
-        path: CSV file, or an npz file with the suffix `.npz`.
 
     Raises:
         LogError: the file cannot be read.
@@ -82,26 +79,23 @@ def _read_csv(path: Path) -> Table:
                 continue
             cells = line.rstrip("\r\n").split(",")
             if len(cells) != len(names):
-                raise _error(path, _ragged(line, len(cells), len(names)), number)
-            try:
-                values.append(np.fromiter(map(float, cells), float, len(cells)))
-            except ValueError:
-                values.append(_with_empty_cells(path, names, cells, number))
+                delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
+                commas = " (decimal commas?)" if len(cells) >= 1.5 * len(names) else ""
+                hint = f" and {delimiters[0]}" if delimiters else commas
+                got = f"got {len(cells)} cells{hint}"
+                raise _error(path, f"{got}, expected {len(names)} as in the header", number)
+            numbers = np.full(len(cells), np.nan)
+            for k, cell in enumerate(cells):
+                try:
+                    numbers[k] = float(cell) if cell.strip() else np.nan
+                except ValueError:
+                    problem = f"got {cell.strip()[:40]!r}, expected a number"
+                    raise _error(path, problem, number, names[k]) from None
+            values.append(numbers)
             row.append(number)
     if not values:
         raise _error(path, "got a header and no rows, expected at least 2 rows")
     return Table(names, np.stack(values), np.array(row))
-
-
-def _with_empty_cells(path: Path, names: tuple[str, ...], cells: list[str], line: int) -> np.ndarray:
-    numbers = np.full(len(cells), np.nan)
-    for k, cell in enumerate(cells):
-        try:
-            numbers[k] = float(cell) if cell.strip() else np.nan
-        except ValueError:
-            problem = f"got {cell.strip()[:40]!r}, expected a number"
-            raise _error(path, problem, line, names[k]) from None
-    return numbers
 
 
 def _check_text(path: Path, head: bytes) -> None:
@@ -119,9 +113,3 @@ def _check_text(path: Path, head: bytes) -> None:
         got = f"byte 0x{head[error.start]:02x} at {error.start}"
         line = head.count(b"\n", 0, error.start) + 1
         raise _error(path, f"got {got}, expected UTF-8 text or npz", line) from error
-
-
-def _ragged(line: str, n_cells: int, n_names: int) -> str:
-    delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
-    hint = f" and {delimiters[0]}" if delimiters else " (decimal commas?)" if n_cells >= 1.5 * n_names else ""
-    return f"got {n_cells} cells{hint}, expected {n_names} as in the header"

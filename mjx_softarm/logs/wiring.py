@@ -1,9 +1,8 @@
 """Check of the wiring by a log: does each chamber move the springs beside it? NumPy only.
 
-Pressures of random poses differ from chamber to chamber. A line through the rows gives the change of each
-spring with each pressure. Within a section it is a stretch and a bend away from the chamber; the other
-sections hardly change. A chamber whose changes are more like those of another one has a valve, or springs
-have sensors, of another number.
+A line through rows of random poses gives the change of each spring with each pressure. It should be a stretch
+of the chamber's section and a bend away from the chamber. A chamber whose changes are more like those of
+another one has a valve, or springs have sensors, of another number.
 """
 
 from __future__ import annotations

@@ -136,8 +136,7 @@ def policy_from_actor(
         reward: the environment's.
         model: networks and workspace of the arm.
         provenance: how the policy came about, in types that JSON has.
-        settings: fields of `Policy` that have defaults, from the run, its environment and its evaluation:
-            `activation`, `observation`, `tolerance_m`, `n_actions`, `action_s`.
+        settings: fields of `Policy` that have defaults.
 
     Raises:
         ValueError: the parameters do not belong to an actor for this arm. It is a SealedFileError if an
@@ -183,9 +182,7 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     """Check a policy and write it, whole or not at all; the same policy gives the same bytes.
 
     Raises:
-        SealedFileError: the policy is not valid, such as a weight that is not finite, or the file cannot be
-            written. An older file stays.
-        TypeError: the provenance holds a value that JSON does not have.
+        SealedFileError: the policy is not valid, or the file cannot be written. An older file stays.
     """
     arrays = file_entries(policy)
     _unpack(arrays, str(path))
@@ -196,8 +193,7 @@ def load_policy(path: str | Path) -> Policy:
     """Read a policy and check all of it.
 
     Raises:
-        SealedFileError: the file cannot be read, is incomplete, damaged, of another program or version, or
-            an entry is missing, unknown, or has a wrong type, shape or range.
+        SealedFileError: the file is no policy of this version, is damaged, or has a wrong entry.
     """
     return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
 
@@ -235,7 +231,6 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
 
 
 def _take_reward(entries: Entries) -> RewardConfig:
-    """Take the weights of the reward, checked."""
     names = [item.name for item in dataclasses.fields(RewardConfig) if item.name != "axes"]
     numbers = {name: entries.take(f"reward.{name}", np.float64, ()) for name in names}
     return RewardConfig(**numbers, axes=tuple(entries.take("reward.axes", np.float64, (6,)).tolist()))
@@ -246,9 +241,9 @@ def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadE
     n_sections = spec.structure.n_sections
     counts = (spec.n_chambers, spec.n_springs)
     return (
-        take_estimator(entries, "estimator", n_sections, spec.n_springs),
-        take_load_estimator(entries, "load_estimator", n_sections, *counts),
-        take_spring_model(entries, "spring_model", *counts),
+        take_estimator(entries, n_sections, spec.n_springs),
+        take_load_estimator(entries, n_sections, *counts),
+        take_spring_model(entries, *counts),
     )
 
 
@@ -287,7 +282,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         estimator=estimator,
         load_estimator=load_estimator,
         spring_model=spring_model,
-        s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
+        s2r=take_s2r(entries, n) if s2r_kind == "mlp" else None,
         spec=spec,
         provenance=entries.table("provenance_json"),
         activation=entries.take("actor.activation", np.str_, ()),

@@ -159,17 +159,12 @@ def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array
 
 def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
     """Return the tip's position (..., 3) [m] and axes (..., 3, 3) at shares (..., n) of the pressures."""
-    spring_m = _springs(policy, share)
+    low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
+    spring_m = expected_springs(policy.spring_model, low + (high - low) * share)
     frame = estimate_frame(policy.estimator, spring_m, policy.spec.mass.payload_kg)
     if policy.s2r is None:
         return frame
     return corrected(policy.s2r, frame, spring_m)
-
-
-def _springs(policy: Policy, share: Array) -> Array:
-    """Return the spring lengths (..., n_springs) [m] at shares (..., n) of the pressures."""
-    low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
-    return expected_springs(policy.spring_model, low + (high - low) * share)
 
 
 def _features_at(policy: Policy, share: Array) -> Array:
@@ -197,9 +192,9 @@ def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
 def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array, policy: Policy) -> Array:
     """Return the lengths (n_springs,) [m] that an arm at rest takes for new references. NumPy and symbols.
 
-    The lengths are the references, except at saturated chambers that are asked for more: they do not follow,
-    and their springs keep their lengths. With redundant chambers, each section takes the plane that fits the
-    chambers which follow; the others only decide what these leave open.
+    Saturated chambers that are asked for more do not follow: their springs keep their lengths. With redundant
+    chambers, each section takes the plane that fits the chambers which follow; the others only decide what
+    these leave open.
 
     Args:
         reference_m (n_springs,) [m]: new references.

@@ -57,8 +57,8 @@ def sensed(
         policy: policy of any kind of observation.
         pose (6,) [mm, deg]: tip pose, as `tip_pose` gives it.
         spring_m (n,) [m]: spring lengths.
-        motion: earlier lengths, references and integral; used by policies that observe motion.
-        load_kg () [kg]: estimated payload; clipped to the range of training for policies that observe it.
+        motion: used by policies that observe motion.
+        load_kg () [kg]: estimated payload, clipped to the range of training.
     """
     xp = array_namespace(spring_m)
     if policy.observation == "pose":
@@ -82,8 +82,7 @@ def actor_output(policy: Policy, observation: Array) -> Array:
 def action_towards(policy: Policy, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
     """Return the action (..., n) in [-1, 1] from a pose towards a goal (..., 6) [mm, deg], all float32.
 
-    `sensed` (..., k) holds the entries that the policy observes besides pose and goal, as `sensed` gives
-    them.
+    `sensed` (..., k) holds the result of the function `sensed`.
     """
     scale = ObsScale(*(np.asarray(value, np.float32) for value in policy.obs_scale))
     observation = observe(pose, goal, scale, policy.reward)
@@ -102,16 +101,13 @@ class PolicyRunner:
         self.policy = policy
 
     def act(self, pose: ArrayLike, goal: ArrayLike, sensed: ArrayLike | None = None) -> Reference:
-        """Return the spring references that bring the tip from a pose towards a goal.
+        """Return the spring references, within the policy's limits, that bring the tip towards a goal.
 
         Args:
             pose (..., 6) [mm, deg]: tip pose; see `mjx_softarm.sensing.pose`.
             goal (..., 6) [mm, deg]: target of the tip; leading axes broadcast with those of the pose.
             sensed (..., k): entries from the function `sensed`, for a policy that observes them; leading axes
                 broadcast to those of the poses.
-
-        Returns:
-            Readings (..., n) and lengths (..., n) [m], both within the policy's limits.
 
         Raises:
             ValueError: see `action`.
@@ -146,9 +142,7 @@ def _six(name: str, value: ArrayLike) -> np.ndarray:
     with np.errstate(over="ignore"):  # refused below
         array = np.asarray(value, np.float32)
     if array.shape[-1:] != (6,):
-        raise ValueError(
-            f"{name}: got shape {array.shape}, expected (..., 6): x, y, z [mm], yaw, pitch, roll [deg]"
-        )
+        raise ValueError(f"{name}: got shape {array.shape}, expected (..., 6): x, y, z, yaw, pitch, roll")
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: got {array[~np.isfinite(array)][0]}, expected finite numbers")
     return array

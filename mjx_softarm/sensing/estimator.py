@@ -1,15 +1,9 @@
 """Estimators of an arm at rest: tip pose from spring lengths, spring lengths from pressures. NumPy and JAX.
 
-No sensor of the arm sees the tip. Three or more springs give a section's length and bend, a section of
-constant curvature has a closed form, and the sections are in series. Real sections do not bend evenly, since
-the weight below pulls at them. That moves and turns a section's end by a smooth function of the section's
-length and bend, of the direction of gravity, and of the masses below: a polynomial for each section, fitted
-to the simulator. The direction of gravity depends on the sections above, and the masses' place on those
-below. So several passes are made, each over all sections at once, the first one from sections of constant
-curvature.
-
-In the other direction, `expected_springs` predicts the spring lengths at given pressures without a payload.
-The control loop compares them with the readings to find a chamber that has lost its pressure.
+Springs give a section's length and bend, a section of constant curvature has a closed form, and the sections
+are in series. The weight below bends them unevenly. That moves and turns a section's end by a polynomial,
+fitted to the simulator, of its length and bend, of the direction of gravity, and of the masses below. These
+depend on the sections above and below, so several passes are made.
 """
 
 from __future__ import annotations
@@ -158,8 +152,7 @@ def variables(
     """Return what the change of a section's end depends on, (..., N_VARIABLES).
 
     These are its shape, the direction against gravity, the torque of gravity on the masses below, over its
-    acceleration, and the payload. No variable depends on the change itself: directions are in the axes of the
-    section's start, and the masses below turn with a section of constant curvature.
+    acceleration, and the payload. No variable depends on the change itself.
 
     Args:
         length, bend: of the section, (..., 1) [m] and (..., 2) [rad]; all sections may stand in "...".
@@ -222,9 +215,9 @@ def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
 
 
 def section_shapes(spring_site_m: Array, spring_m: Array) -> tuple[Array, Array]:
-    """Return lengths (..., n_sections, 1) [m] and bends (..., n_sections, 2) [rad] of sections.
+    """Return lengths (..., n_sections, 1) [m] and bends (..., n_sections, 2) [rad], by least squares.
 
-    A section turns towards its shorter springs by |bend|. They are least squares over a section's springs.
+    A section turns towards its shorter springs by |bend|.
 
     Args:
         spring_site_m (n_sections, s, 2) [m]: holes of the springs, three or more a section at equal angles.
@@ -238,13 +231,9 @@ def section_shapes(spring_site_m: Array, spring_m: Array) -> tuple[Array, Array]
 
 
 def arcs(length: Array, bend: Array) -> Frame:
-    """Return the ends of sections of constant curvature in the frames of their starts.
+    """Return the ends (..., n_sections) of sections of constant curvature, with shapes of `section_shapes`.
 
-    Args:
-        length, bend: as of `section_shapes`.
-
-    Returns:
-        Positions (..., n_sections, 3) and rotations (..., n_sections, 3, 3).
+    Each is in the frame of its section's start.
 
     Source: Webster, Jones, "Design and Kinematic Modeling of Constant Curvature Continuum Robots", 2010.
     """
@@ -277,7 +266,7 @@ def chain(sections: Frame) -> Frame:
 def backbone(
     base: Frame, spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, at: np.ndarray
 ) -> Frame:
-    """Return frames along the arm, which ends at the tip's pose. NumPy only.
+    """Return frames (n_sections, k) along the arm in the base frame. NumPy only.
 
     Sections of constant curvature are in series, by the springs. The tip's distance from their end is
     spread over the arm: it grows evenly from the base.
@@ -288,9 +277,6 @@ def backbone(
         spring_m (n_sections * s,) [m]: lengths.
         tip (6,) [mm, deg]: pose; with NaN the arm ends where the springs bring it.
         at (k,): places as shares of each section's length; one of them is 1.
-
-    Returns:
-        Positions (n_sections, k, 3) and rotations (n_sections, k, 3, 3) in the base frame.
     """
     # Sections in series; a share of a section has the same share of its springs' lengths
     inner = constant_curvature(spring_site_m, at[:, None] * spring_m)  # (k, n_sections)
@@ -320,12 +306,11 @@ def expected_springs(model: SpringModel, pressure_kpa: Array) -> Array:
     return model.spring_centre_m + model.spring_scale_m * mlp(model.layers, normalised)
 
 
-def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int) -> PoseEstimator:
-    """Take the estimator `name` from the entries of a file."""
+def take_estimator(entries: Entries, n_sections: int, n_springs: int) -> PoseEstimator:
+    """Take the pose estimator from the entries of a file."""
     return entries.network(
-        name,
+        "estimator",
         PoseEstimator,
-        {},
         coefficient=(n_sections, N_TERMS, N_CHANGES),
         variable_centre=(n_sections, N_VARIABLES),
         variable_scale=(n_sections, N_VARIABLES),
@@ -340,14 +325,14 @@ def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int)
     )
 
 
-def take_spring_model(entries: Entries, name: str, n_chambers: int, n_springs: int) -> SpringModel:
-    """Take the spring model `name` from the entries of a file."""
+def take_spring_model(entries: Entries, n_chambers: int, n_springs: int) -> SpringModel:
+    """Take the spring model from the entries of a file."""
     return entries.network(
-        name,
+        "spring_model",
         SpringModel,
-        {"layers": (n_chambers, n_springs)},
         pressure_centre_kpa=(n_chambers,),
         pressure_scale_kpa=(n_chambers,),
         spring_centre_m=(n_springs,),
         spring_scale_m=(n_springs,),
+        layers=(n_chambers, n_springs),
     )

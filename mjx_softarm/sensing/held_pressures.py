@@ -1,22 +1,17 @@
 """Pressures that hold a calibrated arm at rest, minus the simulated ones: a process for each section.
 
-Real chambers harden, and their areas grow with pressure; simulated chambers do not. This residual depends
-on a section's own springs and pressures, not on the load below it. So the residual of the c chambers of a
-section is a Gaussian process of the section's state u: its spring lengths and simulated pressures,
-standardised. With the covariance V (c, c) between chambers,
+Real chambers harden, and their areas grow with pressure; simulated chambers do not. The residual of the c
+chambers of a section, without their hysteresis, is a Gaussian process of the section's state u: its spring
+lengths and simulated pressures, standardised. With the covariance V (c, c) between chambers,
 
     cov(r(u), r(u')) = k(u, u') V,    k = 1 + u.u' + exp(-|u - u'|^2 / (2 l^2)) + noise where u = u'.
 
-The pressures are those without the chambers' hysteresis (`mjx_softarm.sensing.hysteresis`), which depends on
-the way to a pose, not on the pose.
-
-A payload shows in pressures: about 4 kPa of the paper's arm for each kilogram. The mean of the process
-corrects them. Its variance is the accuracy of a payload: it is large far from the poses of the log.
+Its mean corrects the pressures that show a payload. Its variance, large far from the poses of the log, is the
+accuracy of a payload.
 
 A payload changes a chamber's pressure by the simulated change times a factor. The log of an unloaded arm does
 not show this factor: with all stiffnesses, areas and masses greater by the same share, the log is the same.
-So the factors are normally distributed about 1, with the deviations of `mjx_softarm.sensing.load`, or about
-what poses with a known weight have shown (`calib.fit.payload.fit_payload_scale`).
+So the factors are normally distributed about 1, or about what poses with a known weight have shown.
 
 Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
 """
@@ -105,13 +100,7 @@ def kernel(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
 
 
 def residual(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray) -> Residual:
-    """Return the residual pressures of m arms at rest.
-
-    Args:
-        held: process of the arm.
-        spring_m (m, n_springs) [m]: spring lengths.
-        pressure_kpa (m, n_chambers) [kPa]: simulated pressures that hold these lengths.
-    """
+    """Return the residuals at springs (m, n_springs) [m] that simulated pressures (m, n_chambers) hold."""
     n_sections = held.state.shape[1]
     state = (sections_of(spring_m, pressure_kpa, n_sections) - held.centre) / held.scale
     mean, share = np.empty((len(state), *held.residual_kpa.shape[1:])), np.empty(state.shape[:2])
@@ -150,7 +139,6 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
     if not file.exists():
         return None
     entries = Entries(read_sealed(file, KIND, "python -m calib run"), str(file))
-    # Shapes of the arm's entries
     s, c = n_sections, n_chambers // n_sections
     d = n_springs // n_sections + c
     shapes: dict[str, tuple[int | None, ...]] = {
@@ -166,10 +154,6 @@ def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: in
         "factor": (),
         "factor_sd": (),
     }
-    # Take them, and check what shapes do not show
     arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
-    held = HeldPressures(**arrays)
-    if len(held.state) != len(held.residual_kpa):
-        entries.fail(f"{KIND}.residual_kpa", f"got {len(held.residual_kpa)} rows, expected {len(held.state)}")
     entries.finish(1)
-    return held
+    return HeldPressures(**arrays)

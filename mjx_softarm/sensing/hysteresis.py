@@ -20,12 +20,9 @@ from mjx_softarm._support.xp import Array, array_namespace
 
 
 def stop_after(stop: Array, moved_m: Array, stroke_m: Array) -> Array:
-    """Return states (..., n) in [-1, 1] of stop operators after changes (..., n) [m] of the lengths.
+    """Return states (..., n) of stop operators after changes (..., n) [m] of the lengths; NaN changes none.
 
-    Args:
-        stop (..., n): states before.
-        moved_m (..., n) [m]: change of each chamber's length; NaN leaves its state.
-        stroke_m (n,) [m]: change that brings a state from 0 to 1.
+    A change of `stroke_m` (n,) [m] brings a state from 0 to 1.
     """
     xp = array_namespace(stop, moved_m, stroke_m)
     moved_m = xp.where(xp.isfinite(moved_m), moved_m, 0.0)

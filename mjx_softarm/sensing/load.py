@@ -1,10 +1,9 @@
 """Payload of an arm at rest, estimated from springs and pressures, and averaged. NumPy and JAX.
 
-A payload bends and stretches the arm, and the sensor-space law holds the springs where they were. So springs
-alone do not show a payload; springs and pressures do. A small network predicts from springs: the pressures
-p(l) that hold them without a payload, their change e(l) by a payload, and how well the calibration knows
-p(l). It is distilled from simulated equilibria. The payload m follows by generalised least squares from the
-pressures p that are measured, section by section:
+The sensor-space law holds the springs where they were, so that only springs and pressures together show a
+payload. A small network predicts from springs: the pressures p(l) that hold them without a payload, their
+change e(l) by a payload, and how well the calibration knows p(l). The payload m follows by generalised least
+squares from the measured pressures p, section by section:
 
     D = v(l) V + N + diag(f m e)^2,   I = sum e^T D^-1 e,   m = sum e^T D^-1 (p - p(l)) / I,
 
@@ -16,9 +15,8 @@ all chambers together.
 A payload changes rarely, so estimates are averaged, until two in a row disagree with the average. Errors of
 neighbouring poses are alike, so an average counts as no more certain than its estimates.
 
-Most arms carry the same most of the time: nothing, or the tool of the specification. An estimate that is off
-moves the tip. So what differs from that payload is believed only as far as it is known: of a difference d
-with the standard deviation s, the share 1 - s^2 / d^2. It has the least mean square error where the true
+An estimate that is off moves the tip. So a difference d, with the standard deviation s, from the payload of
+the specification is believed by the share 1 - s^2 / d^2. It has the least mean square error where the true
 difference has the square d^2 - s^2, as it has in the mean.
 """
 
@@ -115,17 +113,15 @@ def holding(estimator: LoadEstimator, spring_m: Array) -> Holding:
 def estimate_load(
     estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array, stop: Array | float = 0.0
 ) -> tuple[Array, Array]:
-    """Estimate the payload of an arm at rest.
+    """Estimate the payload (...) [kg] of an arm at rest, and the half-width (...) [kg] of its 95 % interval.
+
+    The payload may lie below 0 or above `load_scale_kg`.
 
     Args:
         estimator: network of the arm.
         spring_m (..., n_springs) [m]: spring lengths.
         pressure_kpa (..., n_chambers) [kPa]: pressures.
         stop (..., n_chambers): states of the chambers' hysteresis; 0 where the way to this pose is not known.
-
-    Returns:
-        Payload (...) [kg], which may lie below 0 or above `load_scale_kg`, and half-width (...) [kg] of its
-        95 % interval.
     """
     xp = array_namespace(spring_m, pressure_kpa, estimator.slope)
     predicted = holding(estimator, spring_m)
@@ -164,15 +160,12 @@ def averaged(load: Load, estimate_kg: float, half_width_kg: float, largest_kg: f
     return Load(kg, n, 0, False, width_kg, load.assumed_kg)
 
 
-def take_load_estimator(
-    entries: Entries, name: str, n_sections: int, n_chambers: int, n_springs: int
-) -> LoadEstimator:
-    """Take the estimator `name` from the entries of a file."""
+def take_load_estimator(entries: Entries, n_sections: int, n_chambers: int, n_springs: int) -> LoadEstimator:
+    """Take the load estimator from the entries of a file."""
     n_out, c = 2 * n_chambers + n_sections, n_chambers // n_sections
     return entries.network(
-        name,
+        "load_estimator",
         LoadEstimator,
-        {"layers": (n_springs, n_out)},
         slope=(n_springs, n_out),
         spring_centre_m=(n_springs,),
         spring_scale_m=(n_springs,),
@@ -185,4 +178,5 @@ def take_load_estimator(
         own_load_kg=(),
         load_scale_kg=(),
         factor_sd=(),
+        layers=(n_springs, n_out),
     )

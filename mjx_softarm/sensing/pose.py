@@ -26,12 +26,7 @@ _RIGHT = np.array([[1, 2, 3], [0, 7, 2], [3, 0, 5], [6, 1, 0]])
 
 
 def pose_from_frame(position_m: Array, rotation: Array) -> Array:
-    """Return the pose (..., 6) [mm, deg] of a frame in the base frame.
-
-    Args:
-        position_m (..., 3) [m]: origin.
-        rotation (..., 3, 3): axes, as columns.
-    """
+    """Return the pose (..., 6) [mm, deg] of a frame with an origin (..., 3) [m] and axes (..., 3, 3)."""
     xp = array_namespace(position_m, rotation)
     rows = ([rotation[..., row, column] for column in range(3)] for row in range(3))
     (r00, r01, r02), (r10, r11, r12), (r20, _, _) = rows
@@ -46,11 +41,9 @@ def pose_from_frame(position_m: Array, rotation: Array) -> Array:
 
 
 def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
-    """Return the pose (..., 6) [mm, deg] of a frame in the base frame, as from MuJoCo and motion capture.
+    """Return the pose (..., 6) [mm, deg] of a frame with an origin (..., 3) [m], as from motion capture.
 
-    Args:
-        position_m (..., 3) [m]: origin.
-        quaternion (..., 4): w, x, y, z, of length 1; a small error of the length does not matter.
+    A small error of the length of its quaternion (..., 4), w, x, y, z, does not matter.
     """
     return pose_from_frame(position_m, rotation_from_quaternion(quaternion))
 

@@ -1,12 +1,8 @@
 """The sim-to-real network: simulated tip pose and spring lengths -> pose of the real tip.
 
-The network gives a correction of the simulated pose; zero outputs leave the simulation as it is. Orientation
-goes in as two columns of the rotation matrix, and comes out as a Gibbs vector (axis times the tangent of half
-the angle): both are smooth at pitch 90, where yaw and roll are not.
-
-Training in simulation visits arms far from the logged ones. The network must not diverge there, so its inputs
-are clipped to the range of the training rows and its outputs to the range of their corrections.
-`extrapolation` measures how far away such an arm is.
+Orientation goes in as two columns of the rotation matrix, its correction comes out as a Gibbs vector (axis
+times the tangent of half the angle): both are smooth at pitch 90, where yaw and roll are not. Training visits
+arms far from the logged ones, so inputs and outputs are clipped to the range of the training rows.
 
 Source: Sim-to-Real Transfer in Meng et al., N_S2R: (P, L_spring) -> P_S2R.
 """
@@ -43,13 +39,7 @@ class S2R(NamedTuple):
 
 
 def correct(s2r: S2R, pose: Array, spring_m: Array) -> Array:
-    """Return the pose (..., 6) [mm, deg] of the real tip.
-
-    Args:
-        s2r: the network.
-        pose (..., 6) [mm, deg]: simulated, in the base frame.
-        spring_m (..., n) [m]: simulated or sensed spring lengths.
-    """
+    """Return the real tip's pose (..., 6) [mm, deg] by the simulated one and spring lengths (..., n) [m]."""
     return pose_from_frame(*corrected(s2r, frame_from_pose(pose), spring_m))
 
 
@@ -59,10 +49,7 @@ def corrected(s2r: S2R, frame: tuple[Array, Array], spring_m: Array) -> tuple[Ar
 
 
 def extrapolation(s2r: S2R, pose: Array, spring_m: Array) -> Array:
-    """Return the distance (...) to the training rows as a multiple of its limit, for arguments of `correct`.
-
-    Above 1, do not trust the network.
-    """
+    """Return the distance (...) to the training rows over its limit; above 1, do not trust the network."""
     return distance(s2r, inputs(frame_from_pose(pose), spring_m)) / s2r.limit
 
 
@@ -88,11 +75,9 @@ def distance(s2r: S2R, x: Array) -> Array:
 
 
 def apply_correction(frame: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
-    """Move and turn a frame in the base frame; this scales its axes, which changes no angle.
+    """Move and turn a frame in the base frame by a change (..., 6): shift [mm] and Gibbs vector.
 
-    Args:
-        frame: origin (..., 3) [m] and axes (..., 3, 3).
-        change (..., 6): shift [mm], Gibbs vector.
+    This scales the frame's axes, which changes no angle.
     """
     position_m, rotation = frame
     xp = array_namespace(position_m, change)
@@ -114,19 +99,15 @@ def correction_between(pose: Array, real_pose: Array) -> Array:
 
 
 def carry_body(plate_position: Array, plate_rotation: Array, real_pose: Array) -> tuple[Array, Array]:
-    """Estimate the plates of the real arm from the correction of its tip.
+    """Estimate positions and axes of the real arm's plates from the pose of its tip.
 
-    This is an approximation. Each plate moves by a share of the tip's offset that grows evenly along the arm,
-    as under a tilted base, the main cause of the offset, and keeps its direction. The last plate is that of
-    the real tip. A shift of the base itself is not corrected at the base.
+    Each plate moves by a share of the tip's offset that grows evenly along the arm, as under a tilted base,
+    the main cause of the offset, and keeps its direction. The last plate is that of the real tip.
 
     Args:
         plate_position (..., L + 1, 3) [m]: simulated, as in `mjx_softarm.mechanics.kinematics.Frames`.
         plate_rotation (..., L + 1, 3, 3): axes of these plates.
         real_pose (..., 6) [mm, deg]: pose of the tip, from `correct`.
-
-    Returns:
-        Positions and rotations of the real arm's plates, in the same shapes.
     """
     xp = array_namespace(plate_position, real_pose)
     tip_m, rotation = frame_from_pose(real_pose)
@@ -145,8 +126,7 @@ def save_s2r(path: str | Path, s2r: S2R) -> None:
     """Check a network and write it, whole or not at all. Equal networks give equal bytes.
 
     Raises:
-        SealedFileError: the network is not valid, such as a weight that is not finite, or the file cannot be
-            written. A file that was there before is then still there.
+        SealedFileError: the network is not valid, or the file cannot be written. An older file stays.
     """
     arrays = entries_of(KIND, s2r)
     _unpack(arrays, str(path), len(s2r.input_low) - N_POSE_INPUTS)
@@ -157,19 +137,17 @@ def load_s2r(path: str | Path, n_springs: int) -> S2R:
     """Read a network for an arm of n springs, and check all of it.
 
     Raises:
-        SealedFileError: the file cannot be read, is incomplete, damaged, of another kind, or an entry is
-            missing, unknown, or of the wrong type, shape or range.
+        SealedFileError: the file is none of this kind, is damaged, or has a wrong entry.
     """
     return _unpack(read_sealed(Path(path), KIND, "python -m calib run"), str(path), n_springs)
 
 
-def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
-    """Take the network `name` for an arm of n springs from the entries of a file."""
+def take_s2r(entries: Entries, n_springs: int) -> S2R:
+    """Take the network for an arm of n springs from the entries of a file."""
     n_in, n_out = N_POSE_INPUTS + n_springs, N_POSE_OUTPUTS
     s2r = entries.network(
-        name,
+        KIND,
         S2R,
-        {"layers": (n_in, n_out)},
         input_low=(n_in,),
         input_high=(n_in,),
         output_low=(n_out,),
@@ -177,6 +155,7 @@ def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
         anchors=(None, n_in),
         limit=(),
         error_mm=(),
+        layers=(n_in, n_out),
     )
     for item, holds, expected in (
         ("input_high", s2r.input_low < s2r.input_high, "more than input_low"),
@@ -185,12 +164,12 @@ def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
         ("error_mm", np.greater_equal(s2r.error_mm, 0.0), "a number >= 0"),
     ):
         if not np.all(holds):
-            entries.fail(f"{name}.{item}", f"got {getattr(s2r, item)}, expected {expected}")
+            entries.fail(f"{KIND}.{item}", f"got {getattr(s2r, item)}, expected {expected}")
     return s2r
 
 
 def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int) -> S2R:
     entries = Entries(arrays, source)
-    s2r = take_s2r(entries, KIND, n_springs)
+    s2r = take_s2r(entries, n_springs)
     entries.finish(1)
     return s2r

@@ -1,13 +1,8 @@
 """Sensors of the springs: readings <-> calibrated lengths, believed range, and faults.
 
-A sensor is one class. Its fields are the section `[sensor]` of a specification, chosen by `kind`. Its class
-variables describe the readings in logs. Its methods `raw_length` and `raw_reading` map between readings and
-raw lengths l. All sensors share the calibration
-
-    L = beta l + delta
-
-To add a sensor, write a subclass of `Sensor` and list it in `SENSORS`: specification, simulation, logs,
-calibration, twin, policy file and control loop take it from there.
+A sensor is one class, whose fields are the section `[sensor]` of a specification, chosen by `kind`. Its
+methods `raw_length` and `raw_reading` map between readings and raw lengths l. All sensors share the
+calibration L = beta l + delta. To add a sensor, write a subclass of `Sensor` and list it in `SENSORS`.
 """
 
 from __future__ import annotations
@@ -40,7 +35,7 @@ class SensorFault(IntEnum):
 
 
 class Reading(NamedTuple):
-    """Lengths read by the sensors, and the fault of each."""
+    """Lengths by the sensors, and the fault of each."""
 
     length_m: Array  # (..., n), always finite
     fault: Array  # (..., n) int32, a `SensorFault`
@@ -92,15 +87,11 @@ class Sensor:
         raise NotImplementedError
 
     def lengths(self, readings: Array, fallback_m: Array = 0.0) -> Reading:
-        """Return the calibrated spring lengths of readings.
+        """Return the calibrated spring lengths of readings (..., n) [unit], which may be any numbers.
 
-        A reading that gives no length is reported in `fault`: its length is `fallback_m`, and no gradient
-        flows through it. A control loop passes the last good lengths, so that one lost reading holds the
-        arm for a tick. The default of 0 m is a length that no spring has; use it where `fault` is read.
-
-        Args:
-            readings (..., n) [unit]: any numbers, NaN and infinity among them.
-            fallback_m () or (..., n) [m]: length of a faulty reading, finite.
+        A reading that gives no length is reported in `fault`: its length is `fallback_m`, () or (..., n) [m],
+        and no gradient flows through it. A control loop passes the last good lengths, so that one lost
+        reading holds the arm for a tick.
         """
         # Lengths; readings that are not believed are replaced, so that no NaN arises on their way
         xp = array_namespace(readings, fallback_m, *vars(self).values())
@@ -122,25 +113,17 @@ class Sensor:
         return Reading(xp.where(fault == SensorFault.OK.value, length_m, fallback_m), fault)
 
     def readings(self, length_m: Array) -> Array:
-        """Return the readings (..., n) [unit] of springs of calibrated length (..., n) [m].
-
-        A length that no reading has gives NaN; `lengths` reports such a reading.
-        """
+        """Return the readings (..., n) [unit] of calibrated lengths (..., n) [m]; NaN where there is none."""
         xp = array_namespace(length_m, *vars(self).values())
         readings, exists = self.raw_reading((length_m - self.delta_m) / self.beta)
         return xp.where(exists, readings, math.nan)
 
     def describe_faults(self, readings: Array, fault: Array) -> str:
-        """Return a line for each faulty spring: its name in the model, what was read, what was expected.
-
-        Args:
-            readings (n,) [unit]: readings of one arm.
-            fault (n,): faults from `lengths`.
-        """
+        """Return a line for each faulty spring of one arm, from readings and faults (n,) of `lengths`."""
         lines = []
         for index in np.flatnonzero(np.asarray(fault) != SensorFault.OK):
-            values = {name: np.broadcast_to(value, np.shape(fault)) for name, value in vars(self).items()}
-            one = dataclasses.replace(self, **{name: float(value[index]) for name, value in values.items()})
+            each = {name: np.broadcast_to(value, np.shape(fault)) for name, value in vars(self).items()}
+            one = type(self)(**{name: float(value[index]) for name, value in each.items()})
             expected = one.expected(SensorFault(int(fault[index])))
             lines.append(f"spring{index}: got {float(readings[index]):.7g} {self.unit}, expected {expected}")
         return "\n".join(lines)
@@ -168,9 +151,8 @@ class Coil(Sensor):
 
         l = K y / (1 - I_comp y)             y = l / (K + I_comp l)
 
-    Source: equations of the sections on sensing and calibration in Meng et al., "Sensor-Space Based Robust
-    Kinematic Control of Redundant Soft Manipulator by Learning". Their combined mapping prints 4 pi^4 where
-    the derivation gives 4 pi^3; this class follows the derivation.
+    Source: sections on sensing and calibration in Meng et al., "Sensor-Space Based Robust Kinematic Control
+    of Redundant Soft Manipulator by Learning", whose combined mapping prints 4 pi^4 instead of 4 pi^3.
     """
 
     kind = "coil"
@@ -194,14 +176,10 @@ class Coil(Sensor):
         """K = mu_0 N^2 pi r^2 [H m]."""
         return MU_0_H_PER_M * self.turns**2 * math.pi * self.coil_radius_m**2
 
-    def inverse_inductance(self, readings: Array) -> Array:
-        """Return y [1/H] at frequencies (..., n) [Hz]."""
-        return self.capacitance_f * (2.0 * math.pi * readings) ** 2
-
     def raw_length(self, readings: Array) -> tuple[Array, Array]:
         """Map frequencies to wire lengths; there is none where the compensation resonates without a coil."""
         xp = array_namespace(readings, *vars(self).values())
-        inverse_h = self.inverse_inductance(readings)
+        inverse_h = self.capacitance_f * (2.0 * math.pi * readings) ** 2  # y
         coil_share = 1.0 - self.compensation_h * inverse_h  # coil's share of the total inductance
         exists = coil_share > 0.0
         return self.coil_hm * inverse_h / xp.where(exists, coil_share, 1.0), exists

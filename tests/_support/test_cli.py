@@ -106,7 +106,7 @@ def test_functions_of_two_words_get_lists_and_flags():
         ("show files --seeds 0,a", "--seeds: got '0,a', expected whole numbers|N,N,..."),
         ("fail", "Missing from program fail:|--how {bug,file,gone,interrupt}"),
         ("dance", "error: program: got 'dance', expected one of make, show files, fail, late"),
-        ("show dance", "error: program show: got 'dance', expected one of files"),
+        ("show dance", "error: program: got 'show dance', expected one of make, show files"),
         ("make --n 0", "error: n: got 0, expected at least 1"),
         ("fail --how file", "error: absent/file: got 'No such file or directory', expected a file"),
         ("fail --how gone", "error: [Errno 32] gone"),  # of an arm's connection, not of the output
@@ -125,10 +125,7 @@ def test_a_mistake_is_printed_with_what_it_may_be_and_status_2(words, printed, c
     [(None, 0, ""), (3, 3, ""), ("no serial port", 2, "error: no serial port\n")],
 )
 def test_a_program_that_ends_itself_keeps_its_status_or_its_message(code, status, printed, capsys):
-    def ends() -> int:
-        raise SystemExit(code)
-
-    assert cli.guarded(ends) == status
+    assert cli.guarded(lambda: sys.exit(code)) == status
     assert capsys.readouterr().err == printed
 
 
@@ -137,23 +134,17 @@ import sys
 from mjx_softarm._support import cli
 
 def many(n: int) -> int:
-    \"""Print lines.\"""
-    print("line\\n" * n, end="")
-    return 0
-
-def at_once(n: int) -> int:
-    \"""Print lines, each at once.\"""
     for _ in range(n):
         print("line", flush=True)
     return 0
 
-sys.exit(cli.main("program", "About it.", {"many": many, "at once": at_once}))
+sys.exit(cli.main("program", "About it.", {"many": many}))
 """
 
 
 @pytest.mark.parametrize(
     "words, together, status",
-    [("many --help", False, 141), ("many --n 90000", True, 141), ("at once --n 2", False, 141)]
+    [("many --help", False, 141), ("many --n 2", False, 141)]
     + [("many --n one", True, 141), ("many --n one", False, 2)],
 )
 def test_a_command_whose_output_is_not_read_ends_quietly(words, together, status):

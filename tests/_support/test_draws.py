@@ -30,9 +30,3 @@ def test_the_smallest_share_is_a_finite_number(monkeypatch):
     monkeypatch.setattr(jax.random, "uniform", lambda key, shape, minval: jnp.zeros(shape))
     _, normal = draws.both(jax.random.key(2), (2,), (3,))
     assert np.isfinite(normal).all() and (normal < -5).all()
-
-
-def test_what_each_device_does_by_itself_draws_there():
-    keys = jax.random.split(jax.random.key(3), (1, 2))
-    local = jax.pmap(jax.vmap(lambda key: draws.uniform(key, SHAPE)))(keys)
-    np.testing.assert_array_equal(local[0, 1], draws.uniform(keys[0, 1], SHAPE))

@@ -8,20 +8,15 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import archive
 from mjx_softarm._support.archive import SealedFileError, sealed
-from mjx_softarm.control import allocation
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS
-from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
 # Digest of the names that schema 17 stores and of the fields of its specification.
@@ -65,26 +60,6 @@ def arrays_of(path):
         return dict(npz)
 
 
-@pytest.fixture
-def hold(file, monkeypatch):
-    """Make the file's entries others without packing them, which takes most of the time."""
-    arrays = arrays_of(file)
-
-    def hold(drop=(), **changes):
-        kept = {name: value for name, value in (arrays | changes).items() if name not in drop}
-        monkeypatch.setattr(archive, "read_sealed", lambda path, kind, made_by: kept)
-        return arrays
-
-    return hold
-
-
-def reseal(path, drop=(), **changes):
-    """The file with other entries, under a checksum that fits them."""
-    kept = {name: value for name, value in arrays_of(path).items() if name not in drop}
-    kept |= {name.replace("__", "."): value for name, value in changes.items()}
-    path.write_bytes(sealed(kept, export.KIND))
-
-
 def assert_same(one, other):
     jax.tree.map(partial(np.testing.assert_array_equal, strict=True), vars(one), vars(other))
 
@@ -117,13 +92,8 @@ def test_other_arms_and_observations_are_kept(tmp_path, make_arm_model, spec, ob
     save_policy(path, policy)
     again = load_policy(path)
     assert_same(again, policy)
-    assert again.spec == spec and len(again.actions.low) == spec.n_springs
-    assert tuple(arrays_of(path)["obs_layout"]) == again.obs_layout == names
+    assert len(again.actions.low) == spec.n_springs and again.obs_layout == names
     assert arrays_of(path)["action_layout"].tolist() == [f"frequency{k}" for k in range(spec.n_springs)]
-    expected = allocation(spec)
-    assert (again.gains.allocation is None) == (expected is None)
-    for one, other in zip(again.gains.allocation or (), expected or (), strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_networks_of_another_arm_are_refused(make_arm_model):
@@ -139,22 +109,6 @@ def test_networks_of_another_arm_are_refused(make_arm_model):
         policy_from_actor(make_params(n_obs=20), spec, RewardConfig(), model, {})
 
 
-@settings(few, max_examples=150)
-@given(data=st.data())
-@pytest.mark.filterwarnings("error")
-def test_any_entry_in_the_place_of_another_is_read_or_refused(file, hold, data):
-    """As another program may write it."""
-    arrays = hold()
-    name = data.draw(st.sampled_from(sorted(arrays)))
-    dtype = data.draw(st.sampled_from((arrays[name].dtype, np.dtype("f8"), np.dtype("i8"), np.dtype("U4"))))
-    shape = data.draw(st.sampled_from((arrays[name].shape, (), (3,), (0, 6))))
-    hold(**{name: data.draw(npst.arrays(dtype, shape))})
-    try:
-        assert load_policy(file).spec.n_chambers == 9
-    except SealedFileError as error:
-        assert str(error).startswith(f"{file}: ")
-
-
 def test_files_that_are_no_policy(tmp_path):
     path = tmp_path / "other.npz"
     assert refusal(path) == "got 'No such file or directory', expected a file of `python -m train export`"
@@ -166,14 +120,14 @@ def test_files_that_are_no_policy(tmp_path):
     assert refusal(path).startswith("got an archive without a policy's mark at its end")
 
 
-def test_another_schema_is_named_before_anything_else(file):
-    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(16))
-    assert refusal(file) == "schema_version: got 16, expected 17: export the run again, or train it anew"
+def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file, monkeypatch):
+    arrays = arrays_of(file)
 
+    def read(changes):  # without packing, which takes most of the time
+        monkeypatch.setattr(archive, "read_sealed", lambda path, kind, made_by: changes)
 
-def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file, hold):
-    for name, array in hold().items():
-        hold([name])
+    for name, array in arrays.items():
+        read({other: value for other, value in arrays.items() if other != name})
         assert refusal(file) == f"{name}: got nothing, expected an entry"
         spoilt = [(x, f"{x.dtype.name} {x.shape}, expected ") for x in (array.astype("S"), array[None])]
         for bad in (np.nan, np.inf) if array.dtype.kind == "f" else ():
@@ -181,31 +135,32 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
             changed.flat[-1] = bad
             spoilt.append((changed, f"{bad}, expected finite numbers that float32 holds"))
         for changed, message in spoilt:
-            hold(**{name: changed})
+            read(arrays | {name: changed})
             assert refusal(file).startswith(f"{name}: got {message}")
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("entry", "value", "message"),
     [
-        ({"actor__n_layers": np.array(0)}, "actor.n_layers: got 0, expected at least 1"),
-        ({"observation": np.array("force")}, "observation: got force, expected pose or payload or motion"),
-        ({"observation": np.array("payload")}, "obs_layout: got ['pose_x_mm', "),
-        ({"action_layout": np.array(["voltage0"] * 9)}, "action_layout: got ['voltage0', 'voltage0', "),
-        ({"obs_scale__scale": np.zeros(6)}, "obs_scale.scale: got [0.0, "),
-        ({"action__low": np.full(9, 5e6)}, "action.low: got [5000000.0, "),
-        ({"gains__pressure_min_kpa": np.array(20.0)}, "gains.pressure_min_kpa: got 20.0, expected less than"),
-        ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 17"),
-        ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
-        ({"spring_model__spring_scale_m": np.float32(np.zeros(9))}, "spring_model.spring_scale_m: got [0.0"),
-        ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
-        ({"spec_json": np.array('{"nose": 1}')}, "spec_json: nose: got an unknown field, expected name, "),
-        ({"rate_hz": np.array([{}])}, "got a damaged array ("),
+        ("schema_version", 16, "schema_version: got 16, expected 17: export the run again, or train it anew"),
+        ("actor.n_layers", 0, "actor.n_layers: got 0, expected at least 1"),
+        ("observation", "force", "observation: got force, expected pose or payload or motion"),
+        ("observation", "payload", "obs_layout: got ['pose_x_mm', "),
+        ("action_layout", ["voltage0"] * 9, "action_layout: got ['voltage0', 'voltage0', "),
+        ("obs_scale.scale", np.zeros(6), "obs_scale.scale: got [0.0, "),
+        ("action.low", np.full(9, 5e6), "action.low: got [5000000.0, "),
+        ("gains.pressure_min_kpa", 20.0, "gains.pressure_min_kpa: got 20.0, expected less than"),
+        ("rate_hz", 0.0, "rate_hz: got 0.0, expected a number > 0"),
+        ("s2r_kind", "none", "s2r.0.bias: got an unknown entry, expected those of schema 17"),
+        ("workspace", np.zeros((0, 6), np.float32), "workspace: got float32 (0, 6), expected "),
+        ("spring_model.spring_scale_m", np.zeros(9, np.float32), "spring_model.spring_scale_m: got [0.0"),
+        ("provenance_json", "[1]", "provenance_json: got '[1]', expected a JSON object"),
+        ("spec_json", '{"nose": 1}', "spec_json: nose: got an unknown field, expected name, "),
+        ("rate_hz", [{}], "got a damaged array ("),
     ],
 )
-def test_entries_that_do_not_fit(file, changes, message):
-    reseal(file, **changes)
+def test_entries_that_do_not_fit(file, entry, value, message):
+    file.write_bytes(sealed(arrays_of(file) | {entry: np.array(value)}, export.KIND))
     assert refusal(file).startswith(message)
 
 
@@ -218,17 +173,15 @@ def test_policy_that_is_not_finite_is_not_written(file, make_policy):
     assert file.read_bytes() == before
 
 
-@pytest.mark.parametrize("step", ["write_bytes", "replace"])
-def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, monkeypatch, step):
+def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, monkeypatch):
     before = file.read_bytes()
 
     def fail(path, *arguments):
-        if step == "write_bytes":
-            with path.open("wb") as part:
-                part.write(b"PK")
+        with path.open("wb") as part:
+            part.write(b"PK")
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(type(file), step, fail)
+    monkeypatch.setattr(type(file), "write_bytes", fail)
     with pytest.raises(SealedFileError, match=r"policy\.npz: got 'No space left on device'"):
         save_policy(file, make_policy(rate_hz=25.0))
     assert [path.name for path in file.parent.iterdir()] == ["policy.npz"]

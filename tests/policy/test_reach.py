@@ -49,54 +49,36 @@ def test_a_turn_that_is_not_asked_for_costs_nothing():
     np.testing.assert_allclose(near[:3], [0.0, 0.0, -600.0], atol=0.6)
 
 
-def away(goal):
-    return nearest(CONTROLLER.reachable, goal)[1]
-
-
-def brought_back(goal):
-    return clamped(CONTROLLER.reachable, goal)
-
-
-def test_distance_to_reachable_poses():
-    reward = RewardConfig()
+@pytest.mark.parametrize(
+    ("axes", "turn_deg"),
+    [((1,) * 6, 2.0), ((1, 1, 1, 0, 0, 0), 0.0), ((1, 1, 1, 0, 1, 1), 0.0), ((1, 1, 1, 3, 1, 1), 6.0)],
+)
+def test_distance_to_reachable_poses_weighs_the_axes_of_the_goal(axes, turn_deg):
     pose = np.array([[0, 0, -600, 0, 0, 0], [0, 0, -590, 0, 0, 0], [0, 30, -600, 0, 0, 0]], float)
+    reward = RewardConfig(axes=tuple(map(float, axes)))
     reachable = Reachable.from_poses(pose, reward)
     assert reachable.limit == pytest.approx(30 * reward.weight_per_mm)
     near, distance = nearest(reachable, np.array([0, 60, -600, 0, 0, 0]))
     np.testing.assert_array_equal(near, pose[2])
     assert distance == pytest.approx(1.0)
-    _, turned = nearest(reachable, np.array([0, 0, -600, 0, 0, 90]))
-    assert turned == pytest.approx(90 * reward.weight_per_deg / reachable.limit)
-
-
-@pytest.mark.parametrize(
-    ("axes", "turn_deg"), [((1, 1, 1, 0, 0, 0), 0.0), ((1, 1, 1, 0, 1, 1), 0.0), ((1, 1, 1, 3, 1, 1), 6.0)]
-)
-def test_distance_weighs_the_axes_of_the_goal(axes, turn_deg):
-    pose = np.array([[0, 0, -600, 0, 0, 0], [0, 0, -590, 0, 0, 0], [0, 30, -600, 0, 0, 0]], float)
-    reward = RewardConfig(axes=tuple(map(float, axes)))
-    reachable = Reachable.from_poses(pose, reward)
-    _, distance = nearest(reachable, np.array([0, 0, -600, 2, 0, 0]))
-    assert distance * reachable.limit == pytest.approx(turn_deg * reward.weight_per_deg, rel=1e-3, abs=1e-6)
-
-
-def test_goal_within_the_workspace_stays():
-    for goal in GOALS:
-        np.testing.assert_array_equal(brought_back(goal), goal)
+    _, turned = nearest(reachable, np.array([0, 0, -600, 2, 0, 0]))
+    assert turned * reachable.limit == pytest.approx(turn_deg * reward.weight_per_deg, rel=1e-3, abs=1e-6)
 
 
 def test_goal_outside_comes_back_and_is_accepted():
     rng, state = np.random.default_rng(0), start(CONTROLLER)
+    for goal in GOALS:
+        np.testing.assert_array_equal(clamped(CONTROLLER.reachable, goal), goal)
     far = GOALS[0] + rng.uniform(-1, 1, (50, 6)) * [900, 900, 900, 120, 60, 120]
     for goal in [FAR, *far]:
-        assert with_goal(CONTROLLER, state, goal)[1] or away(goal) <= 1.0
-        accepted, events = with_goal(CONTROLLER, state, brought_back(goal))
+        assert with_goal(CONTROLLER, state, goal)[1] or nearest(CONTROLLER.reachable, goal)[1] <= 1.0
+        accepted, events = with_goal(CONTROLLER, state, clamped(CONTROLLER.reachable, goal))
         assert events == () and accepted.goal is not None
 
 
 def test_goal_is_left_on_the_way_from_the_nearest_pose():
     pose, distance = nearest(CONTROLLER.reachable, FAR)
     assert distance > 1.0
-    way, part = FAR[:3] - pose[:3], brought_back(FAR)[:3] - pose[:3]
+    way, part = FAR[:3] - pose[:3], clamped(CONTROLLER.reachable, FAR)[:3] - pose[:3]
     np.testing.assert_allclose(np.cross(way, part), 0.0, atol=1e-6 * (way @ way))
     np.testing.assert_allclose(np.linalg.norm(part) / np.linalg.norm(way), 0.99 / distance, rtol=1e-6)

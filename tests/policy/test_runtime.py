@@ -88,11 +88,8 @@ def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, 
     nowhere = Pool(*[np.zeros((1, 6))] * 4)  # the arm does not move here
     monkeypatch.setattr("mjx_softarm.env.reach.sample_workspace", lambda *_: nowhere)
     env = ReachEnv(spec)
-    action = mode(
-        Actor(9, activation=runner.policy.activation).apply(
-            actor_params, env.observe(*map(jnp.asarray, poses))
-        )[0]
-    )
+    actor = Actor(9, activation=runner.policy.activation)
+    action = mode(actor.apply(actor_params, env.observe(*map(jnp.asarray, poses)))[0])
     reference = runner.act(*poses)
     assert np.min(action) < -0.9 and np.max(action) > 0.9 and np.ptp(action, axis=0).min() > 0.5
     np.testing.assert_allclose(runner.action(*poses), action, rtol=0, atol=1e-5)

@@ -83,12 +83,12 @@ def test_sections_follow_one_another():
     shapes = [(0.15, 0.3, 0.9), (0.22, -2.0, 1.4), (0.2, 1.9, 0.6)]
     even = constant_curvature(SITE_M, np.concatenate([springs_of(*shape) for shape in shapes]))
     position_m, rotation = np.zeros(3), np.eye(3)
-    for n_sections, shape in enumerate(shapes, 1):
-        plate = chain(Frame(even.position_m[:n_sections], even.rotation[:n_sections]))
+    for shape in shapes:
         end_m, turn = integrated(*shape)
         position_m, rotation = position_m + rotation @ end_m, rotation @ turn
-        np.testing.assert_allclose(plate.position_m, position_m, atol=1e-8)
-        np.testing.assert_allclose(plate.rotation, rotation, atol=1e-8)
+    plate = chain(even)
+    np.testing.assert_allclose(plate.position_m, position_m, atol=1e-8)
+    np.testing.assert_allclose(plate.rotation, rotation, atol=1e-8)
 
 
 def test_changes_move_and_turn_the_section_ends():

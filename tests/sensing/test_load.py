@@ -21,7 +21,7 @@ from mjx_softarm.sensing.load import (
 N = 9
 
 
-def estimator_of(rng, error=0.3, dtype=np.float32):
+def estimator_of(rng):
     """An estimator with a hidden layer, all of whose numbers matter."""
     n_out, half = 2 * N + 3, rng.normal(size=(3, 3, 3))
     layers = ((rng.normal(size=(N, 5)), rng.normal(size=5)), (rng.normal(size=(5, n_out)), np.zeros(n_out)))
@@ -30,8 +30,8 @@ def estimator_of(rng, error=0.3, dtype=np.float32):
     plane = rng.normal(size=(N, n_out)), np.full(N, 0.2), np.full(N, 0.05), centre, scale
     known = half @ half.swapaxes(1, 2) + 0.5 * np.eye(3)
     hysteresis = rng.uniform(0.5, 1.0, N), np.full(N, 0.01)
-    numbers = layers, *plane, known, np.tile(error * np.eye(3), (3, 1, 1)), *hysteresis, 0.2, 0.8, 0.04
-    return LoadEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), numbers))
+    numbers = layers, *plane, known, np.tile(0.3 * np.eye(3), (3, 1, 1)), *hysteresis, 0.2, 0.8, 0.04
+    return LoadEstimator(*jax.tree.map(np.float32, numbers))
 
 
 def after(*estimate_kg, width_kg=0.1):
@@ -67,12 +67,9 @@ def test_pressures_of_hysteresis_are_no_payload():
     rng = np.random.default_rng(5)
     estimator, spring_m = estimator_of(rng), rng.uniform(0.15, 0.25, (3, N))
     pressure_kpa, stop = rng.uniform(-40.0, 20.0, (3, N)), rng.uniform(-1.0, 1.0, (3, N))
-    by_way_kpa = estimator.hysteresis_kpa * stop
-    with_it = estimate_load(estimator, spring_m, pressure_kpa + by_way_kpa, stop)
-    np.testing.assert_allclose(
-        with_it, estimate_load(estimator, spring_m, pressure_kpa), rtol=1e-4, atol=1e-4
-    )
-    assert (with_it[0] != estimate_load(estimator, spring_m, pressure_kpa + by_way_kpa)[0]).all()
+    with_it = estimate_load(estimator, spring_m, pressure_kpa + estimator.hysteresis_kpa * stop, stop)
+    without = estimate_load(estimator, spring_m, pressure_kpa)
+    np.testing.assert_allclose(with_it, without, rtol=1e-4, atol=1e-4)
 
 
 def test_numpy_and_jax_agree():
@@ -83,8 +80,7 @@ def test_numpy_and_jax_agree():
 
 
 def test_rests_are_averaged():
-    estimate_kg = 0.5 + 0.05 * np.random.default_rng(1).standard_normal(N_AVERAGED)
-    assert after(*estimate_kg).kg == pytest.approx(estimate_kg.mean())
+    assert after(0.4, 0.5, 0.7, 0.6).kg == pytest.approx(0.55)
     late = after(*[0.5] * 100, 0.6)
     assert late.kg == pytest.approx(0.5 + 0.1 / N_AVERAGED) and late.n_estimates == N_AVERAGED
 

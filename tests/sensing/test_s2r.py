@@ -38,26 +38,19 @@ def springs(n, seed=0):
     return np.random.default_rng(seed).uniform(0.1, 0.25, (n, N_SPRINGS))
 
 
-def network(constant=None, seed=0):
-    """A random network; or one that says a constant (6,)."""
-    rng = np.random.default_rng(seed)
+def network():
+    """A random network."""
+    rng = np.random.default_rng(0)
     sizes = (N_IN, 32, 32, 6)
     layers = [
         (rng.normal(size=(n_in, n_out)) / np.sqrt(n_in), rng.normal(size=n_out))
         for n_in, n_out in itertools.pairwise(sizes)
     ]
     bound = np.array([20.0, 20.0, 20.0, 0.2, 0.2, 0.2])
-    if constant is not None:
-        layers[-1] = (np.zeros((32, 6)), np.asarray(constant))
     low = np.r_[-0.3 * np.ones(3), -np.ones(6), 0.1 * np.ones(N_SPRINGS)]
     high = np.r_[0.3 * np.ones(3), np.ones(6), 0.25 * np.ones(N_SPRINGS)]
     arrays = (low, high, -bound, bound, rng.uniform(-1.0, 1.0, (50, N_IN)), 0.5)
-    layers = tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
-    return S2R(layers, *(np.asarray(a, np.float32) for a in arrays))
-
-
-def moved(pose, change):
-    return pose_from_frame(*apply_correction(frame_from_pose(pose), change))
+    return jax.tree.map(np.float32, S2R(tuple(layers), *arrays))
 
 
 def test_correction_is_a_shift_and_a_turn_in_the_base_frame():
@@ -65,7 +58,8 @@ def test_correction_is_a_shift_and_a_turn_in_the_base_frame():
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     shift_mm = RNG.normal(0.0, 20.0, (200, 3))
     change = np.concatenate([shift_mm, axis * np.tan(angle / 2)], axis=1)
-    (start_m, start_axes), (end_m, end_axes) = frame_from_pose(start), frame_from_pose(moved(start, change))
+    start_m, start_axes = frame_from_pose(start)
+    end_m, end_axes = frame_from_pose(pose_from_frame(*apply_correction((start_m, start_axes), change)))
     np.testing.assert_allclose(end_m, start_m + 1e-3 * shift_mm, atol=1e-12)
     turn = Rotation.from_rotvec(axis * angle).as_matrix()
     np.testing.assert_allclose(end_axes, turn @ start_axes, atol=1e-12)
@@ -76,12 +70,9 @@ def test_correction_between_two_poses_turns_one_into_the_other():
     turns = Rotation.random(500, random_state=2)
     turns = Rotation.from_rotvec(np.deg2rad(170.0) / np.pi * turns.as_rotvec())
     end = pose_from_frame(RNG.uniform(-0.3, 0.3, (500, 3)), turns.as_matrix() @ frame_from_pose(start)[1])
-    reached = moved(start, correction_between(start, end))
+    reached = pose_from_frame(*apply_correction(frame_from_pose(start), correction_between(start, end)))
     for got, expected in zip(frame_from_pose(reached), frame_from_pose(end), strict=True):
         np.testing.assert_allclose(got, expected, atol=1e-9)
-
-
-def test_half_a_turn_gives_finite_numbers():
     half = np.array([0.0, 0.0, 0.0, 180.0, 0.0, 0.0])
     assert np.isfinite(correction_between(np.zeros(6), half)).all()
 
@@ -158,9 +149,8 @@ def test_bad_entries_are_named(tmp_path, entry, value, message):
 
 def test_a_base_that_is_askew_moves_each_plate_by_its_share_of_the_tip_s_way():
     n = 7
-    position = np.stack([np.zeros(n), np.zeros(n), -0.1 * np.arange(n)], axis=-1)
-    tilt = np.radians(2.0)
-    turn = np.array([[1.0, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    position = np.outer(np.arange(n), [0.0, 0.0, -0.1])
+    turn = Rotation.from_euler("x", 2.0, degrees=True).as_matrix()
     tip = pose_from_frame(turn @ position[-1], turn)
     moved, rotation = carry_body(position, np.tile(np.eye(3), (n, 1, 1)), tip)
     np.testing.assert_allclose(moved, position @ turn.T, atol=1e-9)

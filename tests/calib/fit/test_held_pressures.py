@@ -15,6 +15,7 @@ from mjx_softarm.sensing.held_pressures import (
 )
 from mjx_softarm.sensing.hysteresis import stops
 from mjx_softarm.spec import ArmSpec, SpecError
+from tests.arms import FOUR_CHAMBERS
 
 SPEC = ArmSpec.default()
 N = SPEC.n_chambers
@@ -92,11 +93,11 @@ def test_the_file_gives_the_process_back_for_its_own_arm(fit, tmp_path):
         find_pressures(tmp_path, 2, 6, 6)
 
 
-def test_pressures_that_move_nothing_are_no_residual(four_chamber_arm):
+def test_pressures_that_move_nothing_are_no_residual():
     """A log's poses hold any redundant pressures, the law none: pushes alike count alike."""
-    rng, n = np.random.default_rng(3), four_chamber_arm.n_chambers
+    rng, n = np.random.default_rng(3), FOUR_CHAMBERS.n_chambers
     area_m2 = 1.2e-3 * (1.0 + rng.uniform(-0.1, 0.1, n))
-    spec = four_chamber_arm.replace(chambers={"area_m2": tuple(area_m2)})
+    spec = FOUR_CHAMBERS.replace(chambers={"area_m2": tuple(area_m2)})
     plane = np.eye(n) - allocation(spec).redundant
     simulated_kpa = rng.uniform(-20.0, 20.0, (200, n)) @ plane
     spring_m = 0.2 + rng.uniform(-0.02, 0.04, (200, n)) @ plane
