@@ -24,7 +24,7 @@ import numpy as np
 from mjx_softarm._support.fields import PerChamber, PerSection
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.pneumatics import Pneumatics, Regulator
-from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
+from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import (
@@ -33,8 +33,6 @@ from mjx_softarm.twin.instruments import (
     MARKERS_PER_SECTION,
     Build,
     InstrumentedArm,
-    checked_payload,
-    checked_pressures,
     drawn,
     scaled_tolerances,
 )
@@ -114,7 +112,6 @@ class RodTwin(InstrumentedArm):
 
         # Chambers with air and regulators
         self._period_s = 1.0 / self._spec.control.rate_hz
-        self.time_s = 0.0
         area_m2, slope_m = 1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()
         rest_m = self._spec.at_chambers(self._spec.geometry.section_length_m)
         now_m = self._rod.chamber_lengths()
@@ -127,7 +124,7 @@ class RodTwin(InstrumentedArm):
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        self._air.command(self._taken(checked_pressures(pressure_kpa, self._spec)))
+        self._air.command(self._commands(pressure_kpa, self._spec))
         length_m = self._rod.chamber_lengths()
         for _ in range(AIR_STEPS):
             self._air.step(length_m)
@@ -136,7 +133,7 @@ class RodTwin(InstrumentedArm):
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
         """Move to rest at pressures (n,) [kPa] without time passing."""
-        pressure_kpa = self._taken(checked_pressures(pressure_kpa, self._spec))
+        pressure_kpa = self._commands(pressure_kpa, self._spec)
         self._rod.settle(pressure_kpa)
         self._air.hold(pressure_kpa, self._rod.chamber_lengths())
 
@@ -153,17 +150,13 @@ class RodTwin(InstrumentedArm):
         node_m, rotation = self._rod.shape()
         marker_m = self._base_m + node_m[thirds] @ self._base_rotation.T
         tip_m = self._base_m + self._base_rotation @ (node_m[-1] + rotation[-1] @ self._tip_m)
+        tip = self._capture_turn() @ self._base_rotation @ rotation[-1] @ self._tip_turn
+        return self._capture(tip_m, tip, marker_m)
 
-        def turned(vector_rad: np.ndarray) -> np.ndarray:
-            turn = rotation_about(vector_rad) @ self._base_rotation
-            return quaternion_from_rotation(turn @ rotation[-1] @ self._tip_turn)
-
-        return self._seen(tip_m, turned, marker_m)
-
-    def attach(self, payload_kg: float) -> None:
+    def _hang(self, payload_kg: float) -> None:
         parts = self._rod.parts
-        masses = np.array([parts.tool_mass_kg[0], checked_payload(payload_kg)])
-        self._rod.replace(parts._replace(tool_mass_kg=masses))
+        masses = np.array([parts.tool_mass_kg[0], payload_kg])
+        self._rod.parts = parts._replace(tool_mass_kg=masses)
 
 
 def draw_rod(
