@@ -1,0 +1,12 @@
+"""Commands for twins."""
+
+import numpy as np
+
+KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
+
+
+def hold(arm, pressure_kpa, duration_s):
+    """Write pressures, one number or one for each chamber, over a time; return the arm."""
+    for _ in range(round(50 * duration_s)):
+        arm.write_pressures(np.broadcast_to(pressure_kpa, 9))
+    return arm
