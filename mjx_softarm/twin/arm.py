@@ -182,9 +182,8 @@ class Twin(InstrumentedArm):
     def motion_capture(self) -> Capture:
         """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
         spec, data = self._parts.spec, self._data
-        links = spec.structure.links_per_section
-        n_sections = spec.structure.n_sections
-        thirds = np.arange(1, MARKERS_PER_SECTION * n_sections + 1) * links / MARKERS_PER_SECTION
+        n_markers = MARKERS_PER_SECTION * spec.structure.n_sections
+        thirds = np.arange(1, n_markers + 1) * spec.structure.links_per_section / MARKERS_PER_SECTION
         bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
         down = 0.5 * spec.link_length_m[bodies - 1, None] * data.xmat[bodies, 2::3]
         marker_m = self._base_m + (data.xpos[bodies] - down) @ self._base_rotation.T
@@ -199,11 +198,7 @@ class Twin(InstrumentedArm):
         mujoco.mj_step1(self._model, self._data)
 
     def wall_force_n(self) -> WallForce:
-        """Return the largest contact forces in the last control period.
-
-        Returns:
-            Sums [N] of the normal forces on the walls, and on the containers; zeros without a pipe.
-        """
+        """Return the largest contact forces [N] in the last control period; zeros without a pipe."""
         return self._wall_force
 
     def renderer(self, width: int, height: int) -> Any:

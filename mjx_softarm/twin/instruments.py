@@ -75,10 +75,8 @@ class InstrumentedArm(abc.ABC):
     """
 
     def __init__(self, sensor: Sensor, seed: int, session: int, build: Build):
-        up = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,))).integers(
-            2, size=np.size(sensor.delta_m)
-        )
-        shift_m = build.zero_m * (2 * up - 1)
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
+        shift_m = build.zero_m * (2 * rng.integers(2, size=np.size(sensor.delta_m)) - 1)
         self._sensor = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m)
         self._scale = build.noise
         self._lost = build.lost

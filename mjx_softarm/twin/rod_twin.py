@@ -25,7 +25,6 @@ from mjx_softarm._support.fields import PerChamber, PerSection
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.pneumatics import Pneumatics, Regulator
 from mjx_softarm.sensing.pose import rotation_about
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import (
     AS_BUILT,
@@ -105,7 +104,10 @@ class RodTwin(InstrumentedArm):
         self._tip_m = mounting.tip_offset_m + drawn(rng, std.tip_offset_m, 3)
         tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
         self._tip_turn = rotation_about(np.radians(mounting.tip_turn_deg)) @ tip_turn
-        super().__init__(_sensor(rng, self._spec, std), seed, session, build)
+        sensor = self._spec.spring_sensor
+        beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, self._spec.n_springs))
+        delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, self._spec.n_springs)
+        super().__init__(dataclasses.replace(sensor, beta=beta, delta_m=delta_m), seed, session, build)
         parts = draw_rod(rng, seed, self._spec, std, self._base_rotation[2])
         parts = parts._replace(stiffness=(1.0 - build.softening) * parts.stiffness)
         self._rod = self.rod_kind(parts, self._per_section)
@@ -263,14 +265,6 @@ def draw_regulator(seed: int, spec: ArmSpec, deadband: float = 1.0) -> Regulator
         vent_kpa_per_s=range_kpa * each(VENT_PER_S),
         deadband_kpa=deadband * range_kpa * each(DEADBAND),
     )
-
-
-def _sensor(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances) -> Sensor:
-    """Draw the sensors, with the springs' own beta and delta."""
-    sensor = spec.spring_sensor
-    beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, spec.n_springs))
-    delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, spec.n_springs)
-    return dataclasses.replace(sensor, beta=beta, delta_m=delta_m)
 
 
 def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:
