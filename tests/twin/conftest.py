@@ -3,6 +3,7 @@
 import numpy as np
 
 KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
+PRESSURES_KPA = np.array([np.zeros(9), KPA, [5, -20, -8, -3, 8, -25, -15, 6, -6]])
 
 
 def hold(arm, pressure_kpa, duration_s):

@@ -18,11 +18,10 @@ from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import PRESSURE_NOISE_KPA, Build
 from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.rod_twin import RodTwin
-from tests.twin.conftest import KPA, hold
+from tests.twin.conftest import KPA, PRESSURES_KPA, hold
 
 SOPRA = ArmSpec.of(Path("sopra"))
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, per_section=4)  # training's model, moving
-PRESSURES_KPA = np.array([np.zeros(9), KPA, [5, -20, -8, -3, 8, -25, -15, 6, -6]])
 
 
 @pytest.fixture(scope="module")
