@@ -324,7 +324,7 @@ def _for(index: tuple[str, int]) -> str:
 
 
 def _key(array: np.ndarray) -> tuple:
-    return array.dtype.str, array.size, np.ascontiguousarray(array).tobytes()
+    return array.dtype.str, array.size, array.tobytes()
 
 
 def _literal(value: Any) -> str:

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.array_utils import normalize_axis_tuple
 
 REDUCTIONS = ("sum", "min", "max", "all")
 
@@ -167,8 +168,8 @@ def _tried(name: str, *operands: Any, **options: Any) -> Any:
 
 def _reduced(name: str, x: Symbol, axis: Any = None) -> Symbol:
     like = _tried(name, x, axis=axis)
-    axes = tuple(range(x.ndim)) if axis is None else (axis,) if isinstance(axis, int) else axis
-    return Symbol(name, (x,), like.shape, like.dtype, tuple(sorted(item % x.ndim for item in axes)))
+    axes = normalize_axis_tuple(range(x.ndim) if axis is None else axis, x.ndim)
+    return Symbol(name, (x,), like.shape, like.dtype, tuple(sorted(axes)))
 
 
 def _mean(x: Symbol, axis: Any = None) -> Symbol:
