@@ -207,7 +207,7 @@ class _Body:
         if item.op == "input":
             return f"{item.option}[{i}]"
         if item.op == "constant":
-            return self._constant(item.option, i)
+            return self._constant(np.asarray(item.value), i)
         if item.op == "reshape":
             return self._value(item.operands[0], i)
         if item.op == "index":
@@ -324,7 +324,7 @@ def _for(index: tuple[str, int]) -> str:
 
 
 def _key(array: np.ndarray) -> tuple:
-    return array.dtype.str, array.size, array.tobytes()
+    return array.dtype.str, array.size, np.ascontiguousarray(array).tobytes()
 
 
 def _literal(value: Any) -> str:

@@ -8,7 +8,7 @@ NumPy itself decides shapes and types: every operation is tried on arrays of one
 The operations are NumPy's functions of the same name. All are elementwise except
 
     input                            `option`: its name
-    constant                         `option`: its array
+    constant                         `value`: its array
     cast, reshape                    type and shape are the symbol's
     index                            `option`: places (shape) of the elements in the flat operand
     concat, sum, min, max, all       `option`: the axis, or a tuple of axes
@@ -24,7 +24,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.lib.array_utils import normalize_axis_tuple
 
 REDUCTIONS = ("sum", "min", "max", "all")
 
@@ -38,6 +37,7 @@ class Symbol:
     shape: tuple[int, ...]
     dtype: np.dtype
     option: Any = None
+    value: np.ndarray | None = None  # array of a constant
 
     __array_ufunc__ = None  # NumPy arrays leave operators to this class
 
@@ -94,7 +94,7 @@ class Repeat(NamedTuple):
 
 def _operator(name: str, swapped: bool = False) -> Callable[[Symbol, Any], Symbol]:
     def operate(self: Symbol, other: Any) -> Symbol:
-        return getattr(_NAMESPACE, name)(*((other, self) if swapped else (self, other)))
+        return _NAMESPACE[name](*((other, self) if swapped else (self, other)))
 
     return operate
 
@@ -118,7 +118,7 @@ def constant(value: Any) -> Symbol:
     if isinstance(value, Symbol):
         return value
     array = np.asarray(value)
-    return Symbol("constant", (), array.shape, array.dtype, array)
+    return Symbol("constant", (), array.shape, array.dtype, value=array)
 
 
 def elementwise(name: str, *operands: Any) -> Symbol:
@@ -168,8 +168,8 @@ def _tried(name: str, *operands: Any, **options: Any) -> Any:
 
 def _reduced(name: str, x: Symbol, axis: Any = None) -> Symbol:
     like = _tried(name, x, axis=axis)
-    axes = normalize_axis_tuple(range(x.ndim) if axis is None else axis, x.ndim)
-    return Symbol(name, (x,), like.shape, like.dtype, tuple(sorted(axes)))
+    axes = tuple(range(x.ndim)) if axis is None else (axis,) if isinstance(axis, int) else axis
+    return Symbol(name, (x,), like.shape, like.dtype, tuple(sorted(item % x.ndim for item in axes)))
 
 
 def _mean(x: Symbol, axis: Any = None) -> Symbol:
@@ -218,6 +218,9 @@ _OWN = {
 
 class _Namespace:
     """NumPy's functions on symbols; without symbols they are NumPy's own."""
+
+    def __getitem__(self, name: str) -> Callable[..., Any]:
+        return getattr(self, name)
 
     def __getattr__(self, name: str) -> Any:
         plain = getattr(np, name)

@@ -19,6 +19,7 @@ from mjx_softarm.policy.file import LAW, Policy, action_layout, load_policy
 from mjx_softarm.posture import straight_pose
 
 _POSE = {"unit": ["mm"] * 3 + ["deg"] * 3, "names": ["x", "y", "z", "yaw", "pitch", "roll"]}
+FRAME = "base frame: z up; angles intrinsic Z-Y-X; the tip of the straight arm is at {}"
 
 
 def export_onnx(policy_path: Path) -> list[Path]:
@@ -72,12 +73,11 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
     # Units and names that occur several times.
     sensor = policy.sensor
     lengths = {"unit": "m", "names": [f"spring{k}" for k in range(policy.spec.n_springs)]}
-    straight = ", ".join(f"{value:g}" for value in straight_pose(policy.spec))
     readings = {"unit": sensor.unit, "names": list(action_layout(policy.spec))}
     # Inputs and outputs of all graphs, then the arm's numbers.
     return {
         "policy_sha256": sha256,
-        "frame": f"base frame: z up; angles intrinsic Z-Y-X; the tip of the straight arm is at {straight}",
+        "frame": FRAME.format(", ".join(f"{value:g}" for value in straight_pose(policy.spec))),
         "inputs": {
             "readings": readings,
             "goal": _POSE,
