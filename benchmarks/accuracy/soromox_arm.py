@@ -111,10 +111,6 @@ class SoromoxRod:
         self._advance, self._stretch = jax.jit(advance), jax.jit(stretch)
         self._q = self._v = np.zeros(robot.num_coordinates)
 
-    def replace(self, parts: RodParts) -> None:
-        """Change masses of gripper and payload; the strains stay."""
-        self.parts = parts
-
     def shape(self) -> Shape:
         """Return the rod's cross-sections."""
         frame = np.asarray(self._robot.forward_kinematics_abscissa_batched(self._q, self._end_m))

@@ -30,7 +30,6 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
-from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import (
     AS_BUILT,
@@ -38,8 +37,6 @@ from mjx_softarm.twin.instruments import (
     MARKERS_PER_SECTION,
     Build,
     InstrumentedArm,
-    checked_payload,
-    checked_pressures,
 )
 from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
@@ -117,7 +114,6 @@ class Twin(InstrumentedArm):
         self._base_rotation = self._parts.base_rotation
         # Start clock, losses and air.
         self._steps = round(1.0 / (spec.control.rate_hz * self._model.opt.timestep))
-        self.time_s = 0.0
         mujoco.mj_step1(self._model, self._data)
         self._start_losses(spec)
         now_m = chamber_lengths(self._data, spec.n_chambers)
@@ -160,7 +156,7 @@ class Twin(InstrumentedArm):
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        self._air.command(self._taken(checked_pressures(pressure_kpa, self._parts.spec)))
+        self._air.command(self._commands(pressure_kpa, self._parts.spec))
         self._wall_force = WallForce(0.0, 0.0)
         for _ in range(self._steps):
             self._step()
@@ -186,21 +182,15 @@ class Twin(InstrumentedArm):
     def motion_capture(self) -> Capture:
         """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
         spec, data = self._parts.spec, self._data
-        links = spec.structure.links_per_section
-        n_sections = spec.structure.n_sections
-        thirds = np.arange(1, MARKERS_PER_SECTION * n_sections + 1) * links / MARKERS_PER_SECTION
+        n_markers = MARKERS_PER_SECTION * spec.structure.n_sections
+        thirds = np.arange(1, n_markers + 1) * spec.structure.links_per_section / MARKERS_PER_SECTION
         bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
         down = 0.5 * spec.link_length_m[bodies - 1, None] * data.xmat[bodies, 2::3]
         marker_m = self._base_m + (data.xpos[bodies] - down) @ self._base_rotation.T
-        tip_m, tip = self.tip()
+        tip_m, rotation = self.tip()
+        return self._capture(tip_m, self._capture_turn() @ rotation, marker_m)
 
-        def turned(vector_rad: np.ndarray) -> np.ndarray:
-            return quaternion_from_rotation(rotation_about(vector_rad) @ tip)
-
-        return self._seen(tip_m, turned, marker_m)
-
-    def attach(self, payload_kg: float) -> None:
-        payload_kg = checked_payload(payload_kg)
+    def _hang(self, payload_kg: float) -> None:
         body = self._model.body("payload").id
         self._model.body_mass[body] = payload_kg
         self._model.body_inertia[body] = payload_kg * self._parts.spec.mass.gripper_length_m**2 / 12
@@ -208,11 +198,7 @@ class Twin(InstrumentedArm):
         mujoco.mj_step1(self._model, self._data)
 
     def wall_force_n(self) -> WallForce:
-        """Return the largest contact forces in the last control period.
-
-        Returns:
-            Sums [N] of the normal forces on the walls, and on the containers; zeros without a pipe.
-        """
+        """Return the largest contact forces [N] in the last control period; zeros without a pipe."""
         return self._wall_force
 
     def renderer(self, width: int, height: int) -> Any:

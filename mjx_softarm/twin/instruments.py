@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
@@ -49,19 +49,14 @@ def drawn(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray
     return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
 
 
-def length_ratio(spec: ArmSpec) -> float:
-    """Return the mean length of an arm's sections over that of the paper's arm."""
-    paper = ArmSpec.default()
-    return float(np.mean(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m))
-
-
 def scaled_tolerances(tolerances: Any, gap: float, spec: ArmSpec, **factors: np.ndarray) -> Any:
     """Return the tolerances of an arm, from a dataclass with the paper's arm's tolerances.
 
     All are multiplied by the gap. Lengths, whose names end in `_m`, are in proportion to the arm's lengths;
     other fields are multiplied by `factors`, by name.
     """
-    length = length_ratio(spec)
+    paper = ArmSpec.default()
+    length = float(np.mean(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m))
     scaled = {
         name: gap * x * (length if name.endswith("_m") else factors.get(name, 1.0))
         for name, x in dataclasses.asdict(tolerances).items()
@@ -80,10 +75,8 @@ class InstrumentedArm(abc.ABC):
     """
 
     def __init__(self, sensor: Sensor, seed: int, session: int, build: Build):
-        up = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,))).integers(
-            2, size=np.size(sensor.delta_m)
-        )
-        shift_m = build.zero_m * (2 * up - 1)
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
+        shift_m = build.zero_m * (2 * rng.integers(2, size=np.size(sensor.delta_m)) - 1)
         self._sensor = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m)
         self._scale = build.noise
         self._lost = build.lost
@@ -99,12 +92,18 @@ class InstrumentedArm(abc.ABC):
         """Return the chambers' true pressures (n,)."""
 
     @abc.abstractmethod
+    def _hang(self, payload_kg: float) -> None:
+        """Replace the payload at the finger tips."""
+
     def attach(self, payload_kg: float) -> None:
         """Hang a payload to the finger tips, in place of an earlier payload.
 
         Raises:
             ValueError: the mass is negative or not finite.
         """
+        if not (np.isfinite(payload_kg) and payload_kg >= 0.0):
+            raise ValueError(f"payload_kg: got {payload_kg!r}, expected a number >= 0")
+        self._hang(payload_kg)
 
     def release(self) -> None:
         """Remove the payload."""
@@ -121,48 +120,34 @@ class InstrumentedArm(abc.ABC):
         kpa = self._true_kpa()
         return kpa + self._draw(PRESSURE_NOISE_KPA, len(kpa))
 
-    def _seen(
-        self, tip_m: np.ndarray, turned: Callable[[np.ndarray], np.ndarray], marker_m: np.ndarray
-    ) -> Capture:
-        """Return tip (3,) and markers (k, 3) with noise; `turned` gives the tip's quaternion after a turn."""
-        quaternion = turned(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
+    def _capture_turn(self) -> np.ndarray:
+        """Draw the turn (3, 3) by which motion capture sees the tip's rotation off."""
+        return rotation_about(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
+
+    def _capture(self, tip_m: np.ndarray, rotation: np.ndarray, marker_m: np.ndarray) -> Capture:
+        """Return tip (3,) and markers (k, 3) with noise; the tip's rotation (3, 3) already has its noise."""
         noise_m = self._draw(CAPTURE_NOISE_M, len(marker_m) + 1, 3)
         length_m = self._lengths_m()
         spring_m = length_m + self._draw(SPRING_NOISE_M, len(length_m))
+        quaternion = quaternion_from_rotation(rotation)
         return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
 
-    def _taken(self, pressure_kpa: np.ndarray) -> np.ndarray:
-        """Return the commands (n,) [kPa] that the regulators take; a lost chamber has none."""
-        return np.where(np.arange(len(pressure_kpa)) == self._lost, 0.0, pressure_kpa)
+    def _commands(self, pressure_kpa: np.ndarray, spec: ArmSpec) -> np.ndarray:
+        """Return the commands (n,) [kPa] that the regulators take: clipped, and none for a lost chamber.
+
+        Raises:
+            ValueError: the shape is wrong, or a pressure is beyond the arm's limits.
+        """
+        low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+        command = np.asarray(pressure_kpa, float)
+        if command.shape != (spec.n_chambers,):
+            raise ValueError(f"pressure_kpa: got shape {command.shape}, expected ({spec.n_chambers},)")
+        within = (command >= low - PRESSURE_TOLERANCE_KPA) & (command <= high + PRESSURE_TOLERANCE_KPA)
+        if not within.all():
+            chamber = int(np.argmin(within))
+            text = f"got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
+            raise ValueError(f"pressure_kpa[{chamber}]: {text}")
+        return np.where(np.arange(spec.n_chambers) == self._lost, 0.0, np.clip(command, low, high))
 
     def _draw(self, deviation: float, *shape: int) -> np.ndarray:
         return self._scale * deviation * self._rng.standard_normal(shape)
-
-
-def checked_pressures(pressure_kpa: np.ndarray, spec: ArmSpec) -> np.ndarray:
-    """Return commanded pressures (n,) [kPa], clipped to the limits.
-
-    Raises:
-        ValueError: the shape is wrong, or a pressure is beyond the arm's limits.
-    """
-    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    command = np.asarray(pressure_kpa, float)
-    if command.shape != (spec.n_chambers,):
-        raise ValueError(f"pressure_kpa: got shape {command.shape}, expected ({spec.n_chambers},)")
-    within = (command >= low - PRESSURE_TOLERANCE_KPA) & (command <= high + PRESSURE_TOLERANCE_KPA)
-    if not within.all():
-        chamber = int(np.flatnonzero(~within)[0])
-        text = f"got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
-        raise ValueError(f"pressure_kpa[{chamber}]: {text}")
-    return np.clip(command, low, high)
-
-
-def checked_payload(payload_kg: float) -> float:
-    """Return a payload [kg].
-
-    Raises:
-        ValueError: the mass is negative or not finite.
-    """
-    if not (np.isfinite(payload_kg) and payload_kg >= 0.0):
-        raise ValueError(f"payload_kg: got {payload_kg!r}, expected a number >= 0")
-    return payload_kg

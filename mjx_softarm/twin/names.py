@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from mjx_softarm.mechanics.pipe import PIPES
@@ -11,7 +12,8 @@ from mjx_softarm.twin.instruments import AGED, AS_BUILT, EXACT
 from mjx_softarm.twin.rod_twin import RodTwin
 
 ROD = "rod"
-_BUILDS = {":aged": AGED, ":exact": EXACT}
+_BUILDS = {None: AS_BUILT, "aged": AGED, "exact": EXACT}
+_NAME = re.compile(r"(.*?)(?::(aged|exact))?(?::lost(\d+))?(?::(\d+)g)?", re.DOTALL)
 
 
 def twin_of(name: str) -> Twin | RodTwin:
@@ -23,12 +25,11 @@ def twin_of(name: str) -> Twin | RodTwin:
     Raises:
         ValueError: the name is malformed, the arm is unknown, or the arm does not fit into the pipe.
     """
-    name, payload_kg = _without_payload(name)
-    rest, _, last = name.rpartition(":lost")
-    name, lost = (rest, int(last)) if rest and last.isdecimal() else (name, None)
-    suffix = next(filter(name.endswith, _BUILDS), "")
-    build = _BUILDS.get(suffix, AS_BUILT)._replace(lost=lost)
-    name = name.removesuffix(suffix)
+    match = _NAME.fullmatch(name)
+    assert match  # the first group takes everything
+    name, build, lost, grams = match.groups()
+    build = _BUILDS[build]._replace(lost=None if lost is None else int(lost))
+    payload_kg = 1e-3 * int(grams or 0)
     if name.startswith(f"{ROD}:"):
         number, spec = _seed_and_arm(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED")
         return RodTwin(number, spec, payload_kg, build=build)
@@ -39,13 +40,6 @@ def twin_of(name: str) -> Twin | RodTwin:
             f"twin:{rest}:PIPE: got {pipe!r}, expected one of {', '.join(PIPES)}, or grams, 500g"
         )
     return Twin(number, spec, payload_kg, build=build, pipe=PIPES[pipe] if pipe else None)
-
-
-def _without_payload(name: str) -> tuple[str, float]:
-    """Return the name without its payload, and the payload [kg]."""
-    rest, _, last = name.rpartition(":")
-    grams = last.removesuffix("g")
-    return (rest, 1e-3 * int(grams)) if rest and last != grams and grams.isdecimal() else (name, 0.0)
 
 
 def _seed_and_arm(text: str, form: str) -> tuple[int, ArmSpec | None]:

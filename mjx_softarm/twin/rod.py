@@ -77,13 +77,19 @@ class Shape(NamedTuple):
 
 
 class Rod:
-    """A rod with its strains `q` (n, 6), its only state."""
+    """A rod with its strains `q` (n, 6), its only state; masses of the tool in `parts` may be replaced."""
 
     def __init__(self, parts: RodParts, per_section: int):
         """Make a straight rod without force, with `per_section` elements in each section."""
+
+        def each(value: np.ndarray) -> np.ndarray:
+            """Return numbers of the sections (s, ...) for each of their elements (n, m)."""
+            return np.repeat(value.reshape(len(parts.bending), -1), per_section, axis=0)
+
         # Joints and elasticity of each element.
+        self.parts = parts
         self.per_section = per_section
-        self.length_m = np.repeat(parts.section_length_m / per_section, per_section)[:, None]  # (n, 1)
+        self.length_m = each(parts.section_length_m / per_section)  # (n, 1)
         n_sections, n_chambers = parts.stiffness.shape
         self._joint = np.tile(np.eye(3), (n_sections * per_section, 1, 1))
         self._joint[::per_section] = parts.joint
@@ -95,32 +101,22 @@ class Rod:
         # d(nu + kappa x r) / dq (n, c + k fibres, 3, 6 strains)
         self._along = np.concatenate([-_cross_matrix(hole), np.broadcast_to(np.eye(3), (*hole.shape, 3))], -1)
         self._square = np.swapaxes(self._along, -1, -2) @ self._along
-        # Rest state and damping.
-        self.replace(parts)
-        self.q = np.tile(REST_STRAIN, (n_sections * per_section, 1))
-        stiffness = self._local(self.q, np.zeros((n_sections, n_chambers)))[1]
-        self.damping = CREEP_S * np.diagonal(stiffness, axis1=1, axis2=2).ravel()
-
-    def replace(self, parts: RodParts) -> None:
-        """Change masses, areas or stiffnesses of the parts; the strains stay."""
-        self.parts = parts
-
-        def each(value: np.ndarray) -> np.ndarray:
-            """Return numbers of the sections (s, ...) for each of their elements (n, m)."""
-            return np.repeat(value.reshape(len(parts.bending), -1), self.per_section, axis=0)
-
+        # Laws of the fibres, and masses.
         self._section_m = each(parts.section_length_m)
         chambers = parts.stiffness, parts.skew, parts.hardening, parts.rest_m, parts.area, parts.area_slope
         self._chamber_law = [each(value) for value in chambers]
         self._growth = each(parts.area_growth)
         self._spring_law = each(parts.spring_stiffness), each(parts.spring_rest_m)
-        mass = np.repeat(parts.section_mass_kg / self.per_section, self.per_section)
+        mass = each(parts.section_mass_kg / per_section)[:, 0]
         self._node_kg = 0.5 * (mass + np.append(mass[1:], 0.0))  # (n,) lumped at the lower ends
+        # Rest state and damping.
+        self.q = np.tile(REST_STRAIN, (n_sections * per_section, 1))
+        stiffness = self._local(self.q, np.zeros((n_sections, n_chambers)))[1]
+        self.damping = CREEP_S * np.diagonal(stiffness, axis1=1, axis2=2).ravel()
 
     def shape(self) -> Shape:
         """Return the rod's cross-sections."""
-        half, turn = (rotation_about(share * self.length_m * self.q[:, :3]) for share in (0.5, 1.0))
-        return self._shape(half, turn)[0]
+        return self._shape()[0]
 
     def chamber_lengths(self) -> np.ndarray:
         """Return the lengths (s c,) [m] of the chambers."""
@@ -163,8 +159,9 @@ class Rod:
         got = f"a force of {left:.2g} N m^2 or N m after {SETTLE_STEPS} steps"
         raise FloatingPointError(f"rod: got {got}, expected under {REST_TOLERANCE:g}")
 
-    def _shape(self, half: np.ndarray, turn: np.ndarray) -> tuple[Shape, np.ndarray, np.ndarray]:
+    def _shape(self) -> tuple[Shape, np.ndarray, np.ndarray]:
         """Return the shape, and the axes (n, 3, 3) at the beginning and in the middle of each element."""
+        half, turn = (rotation_about(share * self.length_m * self.q[:, :3]) for share in (0.5, 1.0))
         rotation = [np.eye(3)]
         begin = []
         for joint, own in zip(self._joint, turn, strict=True):
@@ -245,8 +242,7 @@ class Rod:
         h = self.length_m
         parts = self.parts
         bend = self.q[:, :3]
-        half, turn = rotation_about(0.5 * h * bend), rotation_about(h * bend)
-        (node, rotation), begin, middle = self._shape(half, turn)
+        (node, rotation), begin, middle = self._shape()
         tool = node[-1] - parts.tool_offset_m[:, None] * rotation[-1, :, 2]
         below = self._node_kg[:, None] * node[1:]
         moment = np.cumsum(below[::-1], axis=0)[::-1] + parts.tool_mass_kg @ tool

@@ -24,8 +24,7 @@ import numpy as np
 from mjx_softarm._support.fields import PerChamber, PerSection
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.pneumatics import Pneumatics, Regulator
-from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
-from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import (
     AS_BUILT,
@@ -33,8 +32,6 @@ from mjx_softarm.twin.instruments import (
     MARKERS_PER_SECTION,
     Build,
     InstrumentedArm,
-    checked_payload,
-    checked_pressures,
     drawn,
     scaled_tolerances,
 )
@@ -107,14 +104,16 @@ class RodTwin(InstrumentedArm):
         self._tip_m = mounting.tip_offset_m + drawn(rng, std.tip_offset_m, 3)
         tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
         self._tip_turn = rotation_about(np.radians(mounting.tip_turn_deg)) @ tip_turn
-        super().__init__(_sensor(rng, self._spec, std), seed, session, build)
+        sensor = self._spec.spring_sensor
+        beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, self._spec.n_springs))
+        delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, self._spec.n_springs)
+        super().__init__(dataclasses.replace(sensor, beta=beta, delta_m=delta_m), seed, session, build)
         parts = draw_rod(rng, seed, self._spec, std, self._base_rotation[2])
         parts = parts._replace(stiffness=(1.0 - build.softening) * parts.stiffness)
         self._rod = self.rod_kind(parts, self._per_section)
 
         # Chambers with air and regulators
         self._period_s = 1.0 / self._spec.control.rate_hz
-        self.time_s = 0.0
         area_m2, slope_m = 1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()
         rest_m = self._spec.at_chambers(self._spec.geometry.section_length_m)
         now_m = self._rod.chamber_lengths()
@@ -127,7 +126,7 @@ class RodTwin(InstrumentedArm):
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        self._air.command(self._taken(checked_pressures(pressure_kpa, self._spec)))
+        self._air.command(self._commands(pressure_kpa, self._spec))
         length_m = self._rod.chamber_lengths()
         for _ in range(AIR_STEPS):
             self._air.step(length_m)
@@ -136,7 +135,7 @@ class RodTwin(InstrumentedArm):
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
         """Move to rest at pressures (n,) [kPa] without time passing."""
-        pressure_kpa = self._taken(checked_pressures(pressure_kpa, self._spec))
+        pressure_kpa = self._commands(pressure_kpa, self._spec)
         self._rod.settle(pressure_kpa)
         self._air.hold(pressure_kpa, self._rod.chamber_lengths())
 
@@ -153,17 +152,13 @@ class RodTwin(InstrumentedArm):
         node_m, rotation = self._rod.shape()
         marker_m = self._base_m + node_m[thirds] @ self._base_rotation.T
         tip_m = self._base_m + self._base_rotation @ (node_m[-1] + rotation[-1] @ self._tip_m)
+        tip = self._capture_turn() @ self._base_rotation @ rotation[-1] @ self._tip_turn
+        return self._capture(tip_m, tip, marker_m)
 
-        def turned(vector_rad: np.ndarray) -> np.ndarray:
-            turn = rotation_about(vector_rad) @ self._base_rotation
-            return quaternion_from_rotation(turn @ rotation[-1] @ self._tip_turn)
-
-        return self._seen(tip_m, turned, marker_m)
-
-    def attach(self, payload_kg: float) -> None:
+    def _hang(self, payload_kg: float) -> None:
         parts = self._rod.parts
-        masses = np.array([parts.tool_mass_kg[0], checked_payload(payload_kg)])
-        self._rod.replace(parts._replace(tool_mass_kg=masses))
+        masses = np.array([parts.tool_mass_kg[0], payload_kg])
+        self._rod.parts = parts._replace(tool_mass_kg=masses)
 
 
 def draw_rod(
@@ -270,14 +265,6 @@ def draw_regulator(seed: int, spec: ArmSpec, deadband: float = 1.0) -> Regulator
         vent_kpa_per_s=range_kpa * each(VENT_PER_S),
         deadband_kpa=deadband * range_kpa * each(DEADBAND),
     )
-
-
-def _sensor(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances) -> Sensor:
-    """Draw the sensors, with the springs' own beta and delta."""
-    sensor = spec.spring_sensor
-    beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, spec.n_springs))
-    delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, spec.n_springs)
-    return dataclasses.replace(sensor, beta=beta, delta_m=delta_m)
 
 
 def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
@@ -24,9 +24,6 @@ from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.logs.files import check_file
 from mjx_softarm.policy.file import SHIPPED, SHIPPED_TWIN, load_policy
 from mjx_softarm.spec import ArmSpec
-
-if TYPE_CHECKING:
-    import viser
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
 HINT = "try next: hang 500 g with the payload slider; the loop estimates it and corrects the circle"
@@ -111,21 +108,16 @@ def _view(
 
 def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Address) -> int:
     from mjx_softarm.view.replay import Timeline, replay, share
+    from mjx_softarm.view.stage import open_server
 
     timelines = [Timeline(path, spec) for path in logs]
     if html is not None:
         speed = share(html, spec, timelines)
         tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
         return 0
-    return replay(_served(at, ", ".join(timeline.name for timeline in timelines)), spec, timelines)
-
-
-def _served(at: Address, label: str) -> viser.ViserServer:
-    from mjx_softarm.view.stage import open_server
-
-    server = open_server(at.host, at.port, label)
+    server = open_server(at.host, at.port, ", ".join(timeline.name for timeline in timelines))
     tell(f"open http://{at.host}:{server.get_port()}; Ctrl-C ends")
-    return server
+    return replay(server, spec, timelines)
 
 
 def _welcome(host: str, url: str) -> None:

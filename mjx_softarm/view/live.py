@@ -205,9 +205,9 @@ def live(
     setup: Setup,
     arm: Any,
     tell: Callable[[str], None],
-    ready: Callable[[str], None] = lambda url: None,
-    save: Callable[[Log], None] | None = None,
-    save_demonstrations: Callable[[Log], None] | None = None,
+    ready: Callable[[str], None],
+    save: Callable[[Log], None] | None,
+    save_demonstrations: Callable[[Log], None] | None,
 ) -> LoopRun:
     """Steer an arm from a page until something ends it; after a fault the page stays until Ctrl-C.
 

@@ -14,7 +14,7 @@ from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
 from mjx_softarm.view.channel import ChannelEnd
 from mjx_softarm.view.look import Limits, Look
-from mjx_softarm.view.panel import BLUE, MUTED, Panel, add_box, css
+from mjx_softarm.view.panel import BLUE, MUTED, Panel, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
 
 FRAME_S, BARS, TRACES = 0.02, 5, 10  # time between frames; frames between bars, and between traces
@@ -81,7 +81,8 @@ class Page:
                 button("Take the pose", "take", "Take the pose at rest as a demonstration", icon.CAMERA)
             if setup.carries:
                 self._add_payload(round(1e3 * spec.mass.largest_payload_kg))
-            add_box(server.gui, "reachable poses", False, points, "Goals are kept near them")
+            box = server.gui.add_checkbox("reachable poses", False, hint="Goals are kept near them")
+            box.on_update(lambda _: setattr(points, "visible", box.value))
         self._listen()
 
     def _button(self, label: str, name: str, hint: str, icon: Any, colour: Any = None) -> None:
@@ -119,18 +120,16 @@ class Page:
         if "look" in news:
             self._heard_s = time.monotonic()
             self._n_frames += 1
+            look = news["look"]
             with self._server.atomic():
-                self._show(news["look"])
+                self._stage.show(look)
+                self._show_gizmo(look)
+                if self._n_frames % BARS == 0:
+                    self._panel.show_bars(look)
+                if self._n_frames % TRACES == 0:
+                    self._panel.show_traces(look)
         if self._n_frames % BARS == 0 or "look" not in news:
             self._show_text(time.monotonic() - self._heard_s)
-
-    def _show(self, look: Look) -> None:
-        self._stage.show(look)
-        self._show_gizmo(look)
-        if self._n_frames % BARS == 0:
-            self._panel.show_bars(look)
-        if self._n_frames % TRACES == 0:
-            self._panel.show_traces(look)
 
     def _show_gizmo(self, look: Look) -> None:
         """Put the gizmo, unless a user drags it, at the loop's goal, where it was left, or at the tip."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import viser
@@ -126,13 +125,6 @@ def _bars(
         parts.append(f"<text {at} text-anchor='middle' fill='{MUTED}'>{words[k].replace('nan', '?')}</text>")
     box = f"viewBox='0 0 {_WIDTH} {_FOOT + 14}' style='width:100%;padding:0 0.6em'"
     return f"<svg {box}>{''.join(parts)}</svg>"
-
-
-def add_box(gui: viser.GuiApi, label: str, shown: bool, node: viser.SceneNodeHandle, hint: str = "") -> Any:
-    """Add a check box that shows a node of the scene, and the nodes below it; return its handle."""
-    box = gui.add_checkbox(label, shown, hint=hint)
-    box.on_update(lambda _: setattr(node, "visible", box.value))
-    return box
 
 
 def css(colour: Sequence[int]) -> str:

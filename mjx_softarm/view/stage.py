@@ -84,7 +84,7 @@ class Stage:
         turned = quaternion_from_rotation(base)
         solid("mount", _disc(*_MOUNT_M), _MOUNT, position=behind, wxyz=turned)
         self._rings = copies("rings", _disc(1.0, _RING_M), rest.rings, _RING)
-        self._folds = copies("bellows", _fold(1.0), rest.folds, _RING)
+        self._folds = copies("bellows", _fold(), rest.folds, _RING)
         self._coils = copies("springs", turn, rest.coils, _SPRING)
         # Tip, seen tip and goal, each with a gripper; payload, markers and trail.
         self._tip = scene.add_frame(f"{name}/tip", show_axes=False)
@@ -142,10 +142,10 @@ def _disc(radius_m: float, height_m: float) -> trimesh.Trimesh:
     return creation.cylinder(radius_m, height_m, sections=48)
 
 
-def _fold(radius_m: float) -> trimesh.Trimesh:
-    """Return one convolution of a bellows about z, of height 1."""
+def _fold() -> trimesh.Trimesh:
+    """Return one convolution of a bellows about z, of radius and height 1."""
     height = np.linspace(-0.5, 0.5, 7)
-    profile = np.stack([radius_m * (0.86 + 0.14 * np.cos(2 * np.pi * height)), height], axis=-1)
+    profile = np.stack([0.86 + 0.14 * np.cos(2 * np.pi * height), height], axis=-1)
     return creation.revolve(profile, sections=18)
 
 

@@ -18,30 +18,16 @@ from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import PRESSURE_NOISE_KPA, Build
 from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.rod_twin import RodTwin
+from tests.twin.conftest import KPA, PRESSURES_KPA, hold
 
 SOPRA = ArmSpec.of(Path("sopra"))
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, per_section=4)  # training's model, moving
-PRESSURES_KPA = np.array(
-    [
-        [0, 0, 0, 0, 0, 0, 0, 0, 0],
-        [-12, 3, -20, -5, -30, 4, 2, -9, -14],
-        [5, -20, -8, -3, 8, -25, -15, 6, -6],
-    ],
-    float,
-)
 
 
 @pytest.fixture(scope="module")
 def noiseless():
     """A twin with everything but noise, brought to rest at some pressures; tests only read it."""
-    arm = Twin(3, build=Build(noise=0.0))
-    hold_pressures(arm, PRESSURES_KPA[1], 10.0)
-    return arm
-
-
-def hold_pressures(arm, pressure_kpa, duration_s):
-    for _ in range(round(50 * duration_s)):
-        arm.write_pressures(pressure_kpa)
+    return hold(Twin(3, build=Build(noise=0.0)), KPA, 10.0)
 
 
 def hold_springs(arm, reference_m, pressure_kpa, gains, duration_s, sensor):
@@ -61,7 +47,7 @@ def test_ideal_twin_rests_where_settle_says(spec):
         expected = settle_many(spec.replace(mass={"payload_kg": payload_kg}), PRESSURES_KPA)
         assert expected.settled.all()
         for k, pressure in enumerate(PRESSURES_KPA):
-            hold_pressures(arm, pressure, 12.0)
+            hold(arm, pressure, 12.0)
             read_m = spec.spring_sensor.lengths(arm.read_sensors()).length_m
             np.testing.assert_allclose(arm.motion_capture().tip_m, expected.tip_position_m[k], atol=2e-5)
             np.testing.assert_allclose(read_m, expected.spring_m[k], atol=2e-5)
@@ -73,7 +59,7 @@ def test_ideal_twins_of_other_arms_rest_where_settle_says(other_arm):
     pressure_kpa = 0.5 * random_pressures(other_arm, 1, 3)
     expected = settle_many(other_arm, pressure_kpa)
     arm = Twin(0, other_arm, build=IDEAL)
-    hold_pressures(arm, pressure_kpa[0], 12.0)
+    hold(arm, pressure_kpa[0], 12.0)
     read_m = other_arm.spring_sensor.lengths(arm.read_sensors()).length_m
     assert expected.settled.all()
     np.testing.assert_allclose(arm.motion_capture().tip_m, expected.tip_position_m[0], atol=4e-5)
@@ -141,10 +127,10 @@ def work_of_pressures(arm, n_ticks):
 def test_arm_that_is_pushed_comes_back_to_rest():
     """No energy from the losses' delay of one time step: a twin at constant pressures stays at rest."""
     arm = Twin(5, build=Build(noise=0.0))
-    hold_pressures(arm, PRESSURES_KPA[2], 5.0)
+    hold(arm, PRESSURES_KPA[2], 5.0)
     arm._data.qvel[:] += 0.3 * np.random.default_rng(0).standard_normal(arm._data.qvel.shape)
     mujoco.mj_step1(arm._model, arm._data)
-    hold_pressures(arm, PRESSURES_KPA[2], 5.0)
+    hold(arm, PRESSURES_KPA[2], 5.0)
     assert np.abs(arm._data.qvel).max() < 1e-3
 
 
@@ -183,7 +169,7 @@ def test_springs_reach_their_references_from_any_side(spec):
     reference_m = settle_many(spec, 0.5 * PRESSURES_KPA[1:2]).spring_m[0].astype(float)
     arm = Twin(2, build=Build(per_section=5))
     for start_kpa in (-14.0, 4.0):
-        hold_pressures(arm, np.full(9, start_kpa), 3.0)
+        hold(arm, start_kpa, 3.0)
         hold_springs(arm, reference_m, np.full(9, start_kpa), gains, 9.0, arm._parts.sensor)
         np.testing.assert_allclose(spring_lengths(arm._data, 9, 9), reference_m, atol=3e-4)
         tips_m.append(np.mean([arm.motion_capture().tip_m for _ in range(50)], axis=0))
@@ -195,7 +181,7 @@ def test_survives_random_extremes():
     arm, rng = Twin(0), np.random.default_rng(0)
     while arm.time_s < 20.0:
         arm.attach(rng.choice([0.0, 1.0]))
-        hold_pressures(arm, rng.choice([-40.0, 20.0], 9), rng.integers(1, 51) / 50)
+        hold(arm, rng.choice([-40.0, 20.0], 9), rng.integers(1, 51) / 50)
         assert np.isfinite(arm.read_sensors()).all()
         assert np.linalg.norm(arm.motion_capture().tip_m) < 1.2
 
@@ -211,7 +197,10 @@ def test_payload_in_a_name():
         open_arm("twin:3:99999999g")
 
 
-@pytest.mark.parametrize("kind", ["", "rod:"])
+both_kinds = pytest.mark.parametrize("kind", ["", "rod:"])
+
+
+@both_kinds
 def test_a_twin_of_another_arm_by_name(kind, tmp_path):
     SOPRA.to_toml(tmp_path / "mine.toml")
     arm = open_arm(f"twin:{kind}7@{tmp_path / 'mine.toml'}")
@@ -222,9 +211,6 @@ def test_a_twin_of_another_arm_by_name(kind, tmp_path):
     assert loaded.motion_capture().tip_m[2] < straight_m - 1e-3
     with pytest.raises(InputError, match="absent.toml: got 'No such file or directory', expected a spec"):
         open_arm(f"twin:{kind}7@absent.toml")
-
-
-both_kinds = pytest.mark.parametrize("kind", ["", "rod:"])
 
 
 @both_kinds
@@ -252,10 +238,7 @@ def test_an_aged_twin_is_the_same_arm_with_shifted_zeros_and_softer_chambers(kin
 
 @both_kinds
 def test_a_twin_may_have_lost_a_chamber(kind):
-    whole, arm = (open_arm(f"twin:{kind}3{lost}") for lost in ("", ":lost4"))
-    for _ in range(100):
-        for twin in (whole, arm):
-            twin.write_pressures(np.full(9, -5.0))
+    whole, arm = (hold(open_arm(f"twin:{kind}3{lost}"), -5.0, 2.0) for lost in ("", ":lost4"))
     others = np.arange(9) != 4
     assert abs(arm._true_kpa()[4]) < 0.3 and (arm._true_kpa()[others] < -1.0).all()
     assert np.argmax(np.abs(arm._lengths_m() - whole._lengths_m())) == 4

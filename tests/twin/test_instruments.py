@@ -9,8 +9,8 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import EVALUATION_SESSION, S2R_SESSION, Build
 from mjx_softarm.twin.rod_twin import RodTwin
+from tests.twin.conftest import KPA, hold
 
-KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
 KINDS = {"twin": (Twin, partial(Build, per_section=4)), "rod": (RodTwin, partial(Build, per_section=3))}
 both_kinds = pytest.mark.parametrize(("make", "build"), KINDS.values(), ids=KINDS)
 
@@ -18,9 +18,7 @@ both_kinds = pytest.mark.parametrize(("make", "build"), KINDS.values(), ids=KIND
 @both_kinds
 def test_seed_chooses_the_arm_and_session_the_noise(make, build):
     def records(seed, noise=1.0, **options):
-        arm = make(seed, build=build(noise=noise), **options)
-        for _ in range(5):
-            arm.write_pressures(KPA)
+        arm = hold(make(seed, build=build(noise=noise), **options), KPA, 0.1)
         return np.concatenate([arm.read_sensors(), arm.pressures(), arm.motion_capture().tip_m])
 
     first = records(7)

@@ -16,16 +16,11 @@ from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import Build
 from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.pipe import CONTAINER, N_PLANKS, _walls, add_pipe, contact_force, is_container
+from tests.twin.conftest import KPA, hold
 
 PIPE = CrossPipe.of_mm(300.0)
 R, Z = 0.15, -0.55
 QUIET = Build(losses=0.0, noise=0.0)
-BENT_KPA = np.array([-12, 3, -20, -5, -30, 4, 2, -9, -14], float)
-
-
-def hold(arm, duration_s, pressure_kpa=0.0):
-    for _ in range(round(50 * duration_s)):
-        arm.write_pressures(np.full(9, pressure_kpa) if np.isscalar(pressure_kpa) else pressure_kpa)
 
 
 def push(arm, body, force_n):
@@ -131,7 +126,7 @@ def test_gripper_pressed_against_the_wall(direction):
     arm, deepest_m = Twin(3, build=QUIET, pipe=PIPE), []
     for k in range(300):
         push(arm, "gripper", min(1.0, k / 100) * 20.0 * np.array(direction))
-        hold(arm, 0.02)
+        hold(arm, 0.0, 0.02)
         deepest_m.append(-arm._data.contact.dist.min() if arm._data.ncon else 0.0)
     assert max(deepest_m) < 5e-3 and deepest_m[-1] < 1e-3
     assert 10.0 < sum(arm.wall_force_n()) < 25.0
@@ -141,10 +136,10 @@ def test_force_is_that_of_the_last_period():
     arm = Twin(3, build=QUIET, pipe=PIPE)
     assert arm.wall_force_n() == (0.0, 0.0)
     push(arm, "link14", [0.0, 30.0, 0.0])
-    hold(arm, 0.8)
+    hold(arm, 0.0, 0.8)
     assert arm.wall_force_n().wall > 1.0
     push(arm, "link14", 0.0)
-    hold(arm, 4.0)
+    hold(arm, 0.0, 4.0)
     assert arm.wall_force_n() == (0.0, 0.0)
 
 
@@ -152,7 +147,7 @@ def test_arm_that_touches_nothing_moves_as_without_a_pipe():
     tips_m = []
     for pipe in (None, PIPE):
         arm = Twin(7, build=Build(noise=0.0), pipe=pipe)
-        hold(arm, 3.0, BENT_KPA)
+        hold(arm, KPA, 3.0)
         assert arm.wall_force_n() == (0.0, 0.0)
         tips_m.append(arm.motion_capture().tip_m)
     np.testing.assert_allclose(*tips_m, atol=1e-9)

@@ -6,8 +6,11 @@ from scipy.optimize import brentq
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.twin.instruments import Build
 from mjx_softarm.twin.rod import GRAVITY_M_S2, Rod, RodParts
+from mjx_softarm.twin.rod_twin import RodTwin
 from tests.arms import OTHER_ARMS
+from tests.twin.conftest import PRESSURES_KPA
 
 LENGTH_M = 0.2
 NONE = np.zeros(9)
@@ -163,15 +166,9 @@ def test_an_ideal_rod_agrees_with_the_training_model(name):
 
     The tapered arm has five, as its first section is longer and wider.
     """
-    from mjx_softarm.twin.instruments import Build
-    from mjx_softarm.twin.rod_twin import RodTwin
-
     spec = OTHER_ARMS.get(name, ArmSpec.default())
     spec = spec.replace(structure={"links_per_section": 5 if name == "tapered" else 4})
-    pressures = np.array(
-        [[0.0] * 9, [-12, 3, -20, -5, -30, 4, 2, -9, -14], [5, -20, -8, -3, 8, -25, -15, 6, -6]]
-    )
-    pressures = as_planes(pressures, spec.structure.chambers_per_section)
+    pressures = as_planes(PRESSURES_KPA, spec.structure.chambers_per_section)
     expected = settle_many(spec, pressures)
     for kpa, tip_m, spring_m in zip(pressures, expected.tip_position_m, expected.spring_m, strict=True):
         arm = RodTwin(0, spec, build=Build(gap=0.0, noise=0.0))

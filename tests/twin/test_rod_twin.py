@@ -13,15 +13,9 @@ from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin import rod, rod_twin
 from mjx_softarm.twin.instruments import Build
 from mjx_softarm.twin.rod_twin import RodTwin
+from tests.twin.conftest import KPA, hold
 
-KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
 EXACT = Build(losses=0.0, noise=0.0, per_section=3)  # without deadband and noise
-
-
-def hold(arm, pressure_kpa, duration_s):
-    for _ in range(round(50 * duration_s)):
-        arm.write_pressures(pressure_kpa)
-    return arm
 
 
 def test_refinement_changes_little():
