@@ -62,7 +62,7 @@ def step(
     Returns:
         The next state, and the faults; its pressures are to be written unless a fault ends the run.
     """
-    belief = believe(controller, state.belief, state.command, readings, late, measured_kpa)
+    belief = believe(state.belief, state.command, readings, late, measured_kpa)
     events = check(state.belief, belief)
     state = state._replace(belief=belief, arrived=False)
     if stop_of(events) is not None:

@@ -148,7 +148,7 @@ def observed(belief: Belief, last_m: np.ndarray | None = None) -> np.ndarray | N
     `last_m` (n_springs,) [m] are the last references, by default those in force.
     """
     controller = belief.controller
-    lengths_m = belief.window.spring_m
+    lengths_m = belief.window_m
     last_m = belief.command.reference_m if last_m is None else last_m
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
     last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
