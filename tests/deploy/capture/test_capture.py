@@ -87,7 +87,7 @@ def test_an_arm_that_stands_is_seen_above_its_base(serve, opened):
         ("natnet:host:tip,left=x", "expected natnet:HOST:BODY or qualisys:HOST:BODY"),
         ("natnet:host:tip,base=b,markers=", "expected natnet:HOST:BODY or qualisys:HOST:BODY"),
         ("natnet:host:tip,up=x", "got up=x, expected y or z"),
-        ("natnet:host:tip", "an arm with its own motion capture"),
+        ("natnet:host:tip", "natnet:host:tip: got an arm with its own motion capture"),
     ],
 )
 def test_names_that_are_refused(name, message):
