@@ -31,7 +31,7 @@ class ListedGoals:
         self,
         controller: Controller,
         goals: Iterable[np.ndarray],
-        duration_s: float | None = None,
+        duration_s: float = np.inf,
         stay: bool = False,
     ):
         self._controller = controller
@@ -58,9 +58,9 @@ class ListedGoals:
         if np.isnan(self._began_s):
             self._began_s = now_s
         state, events = self.take_next(state)
-        over = self._duration_s is not None and now_s - self._began_s >= self._duration_s
         ended = state.goal is None and self.n_taken == len(self._goals)
-        over |= ended and not (self._stays and self._accepted)
+        over = ended and not (self._stays and self._accepted)
+        over |= now_s - self._began_s >= self._duration_s
         return None if over else state, events
 
     def take_next(self, state: LoopState) -> tuple[LoopState, Events]:
@@ -69,12 +69,12 @@ class ListedGoals:
         while state.goal is None and self.n_taken < len(self._goals):
             goal = self._goals[self.n_taken]
             if self.n_taken in self._refused:
-                events: Events = (self._refused[self.n_taken],)
+                refused += (self._refused[self.n_taken],)
             else:
                 state, events = with_goal(self._controller, state, goal)
                 self._accepted |= not events
+                refused += events
             self.n_taken += 1
-            refused += events
         return state, refused
 
 

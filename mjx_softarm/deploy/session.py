@@ -67,7 +67,7 @@ def follow(
     arm: ArmIO,
     controller: Controller,
     goals: Iterable[np.ndarray],
-    duration_s: float | None = None,
+    duration_s: float = np.inf,
     tell: Callable[[str], None] = lambda text: None,
     arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
@@ -257,7 +257,7 @@ class _Session:
         Faults of the payload last until it is next estimated; `estimated` says whether it was.
         """
         for event in events:
-            if event.fault not in self.last and event.response is not Response.VENT:
+            if event.fault not in self.last and event.fault.response is not Response.VENT:
                 self.tell(self._stamped(event))
         lasting = set() if estimated else self.last & PAYLOAD_FAULTS
         self.last = lasting | {event.fault for event in events}
