@@ -44,12 +44,9 @@ class ArmFault(Exception):
 
 
 class Link:
-    """An arm without pressure at first.
+    """An arm without pressure at first, and a control loop of a period `dt_s`.
 
-    Args:
-        arm: the driver; `pressures`, `motion_capture` and `time_s` are used if it has them.
-        spec: the arm, for its numbers of springs and chambers.
-        dt_s: period of the control loop.
+    The driver's `pressures`, `motion_capture` and `time_s` are used if it has them.
     """
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, dt_s: float):
@@ -152,9 +149,8 @@ class Link:
                 in_time, why = False, str(error)
             n_failed = 0 if in_time else n_failed + 1
             if n_failed == VENT_TRIES:
-                raise ArmFault(
-                    f"vent: got {n_failed} failed writes in a row, expected fewer; the last: {why}"
-                )
+                got = f"got {n_failed} failed writes in a row, expected fewer"
+                raise ArmFault(f"vent: {got}; the last: {why}")
             self.wait_until(begin_s + self._dt_s)
 
     def _frame(self) -> dict[str, np.ndarray]:
