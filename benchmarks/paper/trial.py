@@ -149,7 +149,7 @@ def figures(run: LoopRun, controller: Controller, goals: np.ndarray, trial: Tria
     numbers = accuracy.figures(errors, run.counts())
     if trial.lap_s and run.ways:
         numbers |= accuracy.along(accuracy.ways_of(run), controller.dt_s)
-    seen_g = errors.load_estimate_g[np.isfinite(errors.load_estimate_g)]
+    seen_g = 1e3 * errors.load_kg[np.isfinite(errors.load_kg)]
     off_g = float(np.abs(seen_g - trial.load_g).mean()) if len(seen_g) and not trial.objects else np.nan
     at_stops = {name: getattr(errors, name).tolist() for name in ("goal", "error", "saturated")}
     return {**numbers, "load_off_g": off_g, "seconds": float(run.log.time_s[-1]), "at_stops": at_stops}

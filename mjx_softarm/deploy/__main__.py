@@ -93,17 +93,11 @@ class DriverOptions:
     ] = None
 
     def open(self, spec: ArmSpec, tell: Callable[[str], None]) -> Any:
-        """Open the driver of an arm with this specification, and its motion capture, which reports its gaps.
-
-        Raises:
-            InputError: one of them is not available.
-        """
+        """Open the driver of an arm with this specification, and its motion capture."""
         driver = open_arm(self.arm)
-        simulated = self.arm.startswith("twin:")
-        if simulated and ArmSpec.of(twin_spec(self.arm)).geometry != spec.geometry:
-            tell(
-                f"{self.arm} is a twin of another arm than {spec.name!r}, whose twins are twin:SEED@ARM.toml"
-            )
+        if self.arm.startswith("twin:") and ArmSpec.of(twin_spec(self.arm)).geometry != spec.geometry:
+            other = f"a twin of another arm than {spec.name!r}, whose twins are twin:SEED@ARM.toml"
+            tell(f"{self.arm} is {other}")
         return with_capture(driver, self.capture, spec, tell)
 
 
@@ -145,9 +139,8 @@ def _run(
     check_arm(driver, controller, f"--arm {options.arm}")
 
     # The run, its log and its faults
-    limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
-    run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay)
+    run = follow(driver, controller, goals, duration, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver, tell)
@@ -221,15 +214,7 @@ def _measure(
 def _report_accuracy(
     run: LoopRun, controller: Controller, poses: np.ndarray, out: Path, payload_kg: float | None
 ) -> None:
-    """Write and print the figures of a run, and what makes its error.
-
-    Args:
-        run: towards the poses, with an arrival or more.
-        controller: its policy.
-        poses (p, 6) [mm, deg]: goals.
-        out: folder to write to.
-        payload_kg: payload at the gripper; None: not known.
-    """
+    """Write and print the figures of a run towards poses (p, 6) [mm, deg], and what makes its error."""
     accuracy = measure(run, controller, poses)
     ways = ways_of(run)
     numbers = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
@@ -237,7 +222,7 @@ def _report_accuracy(
         "seconds": float(run.log.time_s[-1]),
         **(along(ways, controller.dt_s) if ways else {}),
     }
-    split = None if ways else budget(run, controller, payload_kg)
+    split = None if ways else budget(accuracy, controller.policy, payload_kg)
     if split is not None:
         numbers["budget"] = split.figures()
     if missing := write_accuracy(out, accuracy, numbers, ways):

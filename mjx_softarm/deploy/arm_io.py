@@ -59,16 +59,9 @@ class ArmIO(Protocol):
 
 
 class Capture(NamedTuple):
-    """One frame of motion capture, in the base frame (see `mjx_softarm.sensing.pose`).
+    """One frame of motion capture, in the base frame (see `mjx_softarm.sensing.pose`)."""
 
-    Attributes:
-        tip_m (3,) [m]: centre of the last plate.
-        tip_quaternion (4,): w, x, y, z; 1, 0, 0, 0 where the arm hangs straight.
-        marker_m (n_markers, 3) [m]: from the base to the tip; (0, 3) without markers.
-        spring_m (n,) [m]: spring lengths between markers at their ends, if there are any.
-    """
-
-    tip_m: np.ndarray
-    tip_quaternion: np.ndarray
-    marker_m: np.ndarray
-    spring_m: np.ndarray | None = None
+    tip_m: np.ndarray  # (3,) centre of the last plate
+    tip_quaternion: np.ndarray  # (4,) w, x, y, z; 1, 0, 0, 0 where the arm hangs straight
+    marker_m: np.ndarray  # (n_markers, 3) from the base to the tip; (0, 3) without markers
+    spring_m: np.ndarray | None = None  # (n,) spring lengths between markers at their ends, if there are any

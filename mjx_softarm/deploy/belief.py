@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -40,31 +39,21 @@ LOST_EFFECT_M = 0.01  # least change at the chamber; tolerances and payloads loo
 _NO_EFFECT_M2 = 1e-18
 
 
-class Window(NamedTuple):
-    """Last ticks of an arm, the newest last."""
-
-    spring_m: np.ndarray  # (ticks, n_springs) lengths
-    pressure_kpa: np.ndarray  # (ticks, n_chambers) in force
-    chamber_kpa: np.ndarray  # (ticks, n_chambers) measured, or in force where none was measured
-
-
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Belief about an arm."""
+    """Belief about an arm; windows are of the last ticks, the newest last."""
 
     controller: Controller  # with the arm's models
     command: Command  # in force as the readings were taken
-    window: Window
+    window_m: np.ndarray  # (ticks, n_springs) lengths
+    window_kpa: np.ndarray  # (ticks, n_chambers) pressures in force
+    window_chamber_kpa: np.ndarray  # (ticks, n_chambers) pressures measured, or in force where none was
     spring_m: np.ndarray  # (n_springs,) lengths, the last good ones; NaN before the first
     n_lost: np.ndarray  # (n_springs,) ticks in a row without a reading of a spring
-    stuck: np.ndarray  # (n_springs,) bool: a spring that stands stock-still where it should not
     n_suspect: np.ndarray  # (n_chambers,) ticks in a row in which a chamber seemed to have lost its pressure
-    saturated: np.ndarray  # (n_chambers,) bool: a chamber at its limit, off its reference in the mean
     load: Load  # payload
     stop: np.ndarray  # (n_chambers,) states of the chambers' hysteresis
     n_late: int = 0  # ticks in a row that missed their deadline
-    at_rest: bool = False  # nothing has moved for a window; one after the last action, at the earliest
-    settled: bool = False  # at rest with each spring on its reference, or its chamber at a limit
     why_lost: str = ""  # message of the sensors
     estimate_kg: float | None = None  # payload by this tick's window alone; None: not estimated in this tick
     width_kg: float = 0.0  # half-width of the 95 % interval of `estimate_kg`
@@ -74,14 +63,17 @@ class Belief:
     def none(cls, controller: Controller) -> Belief:
         """Return the belief before the first tick."""
         spec = controller.policy.spec
-        n_springs, n_chambers = spec.n_springs, spec.n_chambers
-        window = Window(*(np.empty((0, n)) for n in (n_springs, n_chambers, n_chambers)))
-        springs = np.zeros(n_springs, int), np.zeros(n_springs, bool)
-        chambers = np.zeros(n_chambers, int), np.zeros(n_chambers, bool)
-        unknown_m = np.full(n_springs, np.nan)
-        load = Load.assumed(spec.mass.payload_kg)
         return cls(
-            controller, Command.none(spec), window, unknown_m, *springs, *chambers, load, np.zeros(n_chambers)
+            controller=controller,
+            command=Command.none(spec),
+            window_m=np.empty((0, spec.n_springs)),
+            window_kpa=np.empty((0, spec.n_chambers)),
+            window_chamber_kpa=np.empty((0, spec.n_chambers)),
+            spring_m=np.full(spec.n_springs, np.nan),
+            n_lost=np.zeros(spec.n_springs, int),
+            n_suspect=np.zeros(spec.n_chambers, int),
+            load=Load.assumed(spec.mass.payload_kg),
+            stop=np.zeros(spec.n_chambers),
         )
 
     @property
@@ -117,11 +109,38 @@ class Belief:
     @property
     def mean_m(self) -> np.ndarray:
         """Mean lengths (n_springs,) [m] over the window."""
-        return self.window.spring_m.mean(axis=0)
+        return self.window_m.mean(axis=0)
+
+    @cached_property
+    def at_rest(self) -> bool:
+        """True if nothing has moved for a window; one after the last action, at the earliest."""
+        rest = self.controller.rest
+        n_ticks = min(len(self.window_m), self.command.n_ticks)
+        return n_ticks >= rest.window and bool(still(self.window_m, rest.still_m))
+
+    @cached_property
+    def settled(self) -> bool:
+        """True at rest with each spring on its reference, or its chamber at a limit."""
+        command = self.command
+        if command.reference_m is None or not self.known or not self.at_rest:
+            return False
+        gains, arrived_m = self.controller.policy.gains, self.controller.rest.arrived_m
+        return bool(on_reference(self.window_m, command.reference_m, command.pressure_kpa, gains, arrived_m))
+
+    @cached_property
+    def saturated(self) -> np.ndarray:
+        """Chambers (n_chambers,), bool, at their limit, off their reference in the mean."""
+        return _saturated(self, self.mean_m)
+
+    @cached_property
+    def stuck(self) -> np.ndarray:
+        """Springs (n_springs,), bool, that stand stock-still where they should not."""
+        if len(self.window_m) < self.controller.window:
+            return np.zeros(len(self.spring_m), bool)
+        return stuck_springs(self.window_m, self.window_kpa, self.controller.policy.spec.structure.n_sections)
 
 
 def believe(
-    controller: Controller,
     last: Belief,
     command: Command,
     readings: np.ndarray | None,
@@ -129,60 +148,46 @@ def believe(
     measured_kpa: np.ndarray | None = None,
 ) -> Belief:
     """Return the belief of a tick from the last one and the command in force; see `loop.step`."""
-    policy, size, in_force_kpa = controller.policy, controller.window, command.pressure_kpa
+    policy = last.controller.policy
+    size = last.controller.window
+    in_force_kpa = command.pressure_kpa
 
-    # Lengths with their hysteresis, and the window that ends with them
+    # Lengths, and the windows that end with them
     spring_m, lost, why = read_lengths(policy.sensor, readings, last.spring_m)
-    stop = hysteresis_after(policy, last.stop, last.spring_m, spring_m)
     seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
-    tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
-    rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
-    belief = Belief(
-        controller=controller,
+    chamber_kpa = np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
+    belief = replace(
+        last,
         command=command,
-        window=Window(*rows),
+        window_m=np.vstack([last.window_m[1 - size :], spring_m]),
+        window_kpa=np.vstack([last.window_kpa[1 - size :], in_force_kpa]),
+        window_chamber_kpa=np.vstack([last.window_chamber_kpa[1 - size :], chamber_kpa]),
         spring_m=spring_m,
         n_lost=np.where(lost, last.n_lost + 1, 0),
-        stuck=np.zeros_like(last.stuck),
-        n_suspect=np.zeros_like(last.n_suspect),
-        saturated=np.zeros_like(last.saturated),
-        load=last.load,
-        stop=stop,
+        stop=hysteresis_after(policy, last.stop, last.spring_m, spring_m),
         n_late=last.n_late + 1 if late else 0,
         why_lost=why,
+        estimate_kg=None,
+        width_kg=0.0,
         n_unweighed=last.n_unweighed + 1,
     )
-    return _with_load(_with_trust(belief, last), last)
 
-
-def _with_trust(belief: Belief, last: Belief) -> Belief:
-    """Return the belief with rest, and with sensors and chambers that are in doubt."""
-    controller, policy = belief.controller, belief.controller.policy
-    pressure_kpa, asked_m = belief.command.pressure_kpa, belief.command.reference_m
-    springs_m = belief.window.spring_m
-    if len(springs_m) == controller.window:
-        at_rest = belief.command.n_ticks >= controller.window and bool(
-            still(springs_m, controller.rest.still_m)
-        )
-        stuck = stuck_springs(springs_m, belief.window.pressure_kpa, policy.spec.structure.n_sections)
-        belief = replace(belief, at_rest=at_rest, stuck=stuck)
-    if asked_m is None or not belief.known:
-        return belief
-
-    gains, tolerance_m = policy.gains, policy.tolerance_m
-    suspect = saturated(pressure_kpa, asked_m, belief.spring_m, gains, tolerance_m)
+    # Chambers in doubt
+    suspect = _saturated(belief, spring_m)
     if suspect.any():
-        suspect &= explained_by_pressure_loss(policy.spring_model, pressure_kpa, belief.spring_m, gains)
-    return replace(
-        belief,
-        settled=belief.at_rest
-        and bool(on_reference(springs_m, asked_m, pressure_kpa, gains, controller.rest.arrived_m)),
-        saturated=saturated(pressure_kpa, asked_m, belief.mean_m, gains, tolerance_m),
-        n_suspect=np.where(suspect, last.n_suspect + 1, 0),
-    )
+        suspect &= explained_by_pressure_loss(policy.spring_model, in_force_kpa, spring_m, policy.gains)
+    return _with_load(replace(belief, n_suspect=np.where(suspect, last.n_suspect + 1, 0)))
 
 
-def _with_load(belief: Belief, last: Belief) -> Belief:
+def _saturated(belief: Belief, spring_m: np.ndarray) -> np.ndarray:
+    """Return which chambers (n_chambers,) are at their limit with these springs off their references."""
+    policy, command = belief.controller.policy, belief.command
+    if command.reference_m is None or not belief.known:
+        return np.zeros(len(command.pressure_kpa), bool)
+    return saturated(command.pressure_kpa, command.reference_m, spring_m, policy.gains, policy.tolerance_m)
+
+
+def _with_load(belief: Belief) -> Belief:
     """Return the belief with the payload that an arm at rest shows, over windows that do not overlap.
 
     An estimate whose interval holds no payload leaves the specified payload. One that is not known well
@@ -192,9 +197,9 @@ def _with_load(belief: Belief, last: Belief) -> Belief:
     if not belief.at_rest or belief.n_unweighed < belief.controller.window or doubtful:
         return belief
     model = belief.controller.policy.load_estimator
-    load = last.load
+    load = belief.load
     most_kg = float(model.load_scale_kg)
-    mean_kpa = belief.window.chamber_kpa.mean(axis=0)
+    mean_kpa = belief.window_chamber_kpa.mean(axis=0)
     estimate_kg, width_kg = map(float, estimate_load(model, belief.mean_m, mean_kpa, belief.stop))
     if not holds_payload(estimate_kg, width_kg, most_kg):
         load = Load.assumed(load.assumed_kg)
@@ -309,9 +314,8 @@ def explained_by_pressure_loss(
     left_m = deviation_m - share[:, None] * effect_m
     explained = 1.0 - xp.sum(left_m**2, axis=1) / xp.sum(deviation_m**2)
     enough = (share > LOST_SHARE) & (explained > EXPLAINED_SHARE)
-    chamber_m = xp.abs(
-        share[:, None] * at_chambers(effect_m, gains.allocation)
-    )  # (n_chambers + 1, n_chambers)
+    chamber_m = share[:, None] * at_chambers(effect_m, gains.allocation)  # (n_chambers + 1, n_chambers)
+    chamber_m = xp.abs(chamber_m)
     lost_m = xp.sum(xp.where(np.eye(n, dtype=bool), chamber_m[:-1], 0.0), axis=1)
     alone = enough[:-1] & (lost_m > LOST_EFFECT_M)
     at_limit = (pressure_kpa <= gains.pressure_min_kpa) | (pressure_kpa >= gains.pressure_max_kpa)

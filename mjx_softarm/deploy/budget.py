@@ -22,9 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.measure import at_rest
-from mjx_softarm.deploy.session import LoopRun
+from mjx_softarm.deploy.measure import Accuracy
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.pose import pose_error
@@ -65,7 +63,7 @@ class Budget(NamedTuple):
     @property
     def largest(self) -> str:
         """Name of the largest part."""
-        return max(self.parts_mm, key=lambda name: self.parts_mm[name])
+        return max(self.parts_mm, key=self.parts_mm.__getitem__)
 
     @property
     def wrong(self) -> bool:
@@ -128,26 +126,16 @@ def _remedies(parts: Budget) -> dict[str, str]:
     }
 
 
-def budget(run: LoopRun, controller: Controller, payload_kg: float | None) -> Budget | None:
-    """Return the budget of a run on an arm with motion capture; None if no goal was measured.
+def budget(accuracy: Accuracy, policy: Policy, payload_kg: float | None) -> Budget | None:
+    """Return the budget of a run towards goals, stop by stop; None if no goal was measured.
 
-    Args:
-        run: towards goals, stop by stop.
-        controller: its policy.
-        payload_kg: payload that hung at the gripper; None: the one that the loop believed.
+    The payload is that which hung at the gripper; None: the one that the loop believed.
     """
-    # The goals, and the arm at rest there, where motion capture saw it and the springs were read
-    policy = controller.policy
-    both = [(arrival.goal, at_rest(run, controller, arrival)) for arrival in run.arrivals]
-    both = [(goal, rest) for goal, rest in both if np.isfinite([*rest.error, *rest.spring_m]).all()]
-    if not both:
+    # The goals at which motion capture saw the tip and the springs were read
+    measured = np.isfinite(np.hstack([accuracy.error, accuracy.spring_m])).all(axis=1)
+    if not measured.any():
         return None
-    goal = np.array([goal for goal, _ in both])
-    seen = np.array([rest.error for _, rest in both])  # (p, 6)
-    spring_m, reference_m = (
-        np.array([getattr(rest, name) for _, rest in both]) for name in ("spring_m", "reference_m")
-    )
-    load_kg = np.array([rest.load_kg for _, rest in both])
+    goal, seen, _, spring_m, reference_m, mask, load_kg = (values[measured] for values in accuracy)
     true_kg = load_kg if payload_kg is None else np.full_like(load_kg, payload_kg)
 
     # Poses with one more ingredient replaced by the truth each, then the models' error
@@ -185,8 +173,8 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float | None) -> Bu
         believed_g=1e3 * float(load_kg.mean()),
         payload_g=None if payload_kg is None else 1e3 * payload_kg,
         off_mm=1e3 * float(np.abs(spring_m - reference_m).max(axis=1).mean()),
-        n_goals=len(both),
-        n_saturated=sum(bool(rest.saturated.any()) for _, rest in both),
+        n_goals=len(goal),
+        n_saturated=int(mask.any(axis=1).sum()),
         loaded=loaded,
         wrong_mm=wrong_mm,
         calibrated=policy.calibrated,
@@ -196,7 +184,7 @@ def budget(run: LoopRun, controller: Controller, payload_kg: float | None) -> Bu
 def _shift(
     policy: Policy, spring_m: np.ndarray, left: np.ndarray, payload_kg: np.ndarray, expected_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return shifts of the springs' zeros that explain the models' errors, and the errors that they explain.
+    """Return shifts (n,) [m] of the springs' zeros, true length minus length read, and errors that they make.
 
     Args:
         policy: with the models.
@@ -204,9 +192,6 @@ def _shift(
         left (p, 6) [mm, deg]: measured pose minus that of the models.
         payload_kg (p,): payload at the gripper.
         expected_mm: the models' held-out error.
-
-    Returns:
-        Shifts (n,) [m]: true length minus length read; errors (p, 6) [mm, deg].
     """
     # Derivatives of the pose by finite differences, then least squares with a prior
     n = spring_m.shape[1]
@@ -226,9 +211,7 @@ def draw(parts: Budget, path: Path) -> None:
 
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     axes = figure.subplots()
-    ordered = sorted(parts.parts_mm.items(), key=lambda item: item[1])
-    names = [name for name, _ in ordered]
-    values = [value for _, value in ordered]
+    names, values = zip(*sorted(parts.parts_mm.items(), key=lambda item: item[1]), strict=True)
     colours = ["tab:red" if name == parts.largest else "tab:blue" for name in names]
     axes.bar_label(axes.barh(names, values, color=colours), fmt="%.2f", padding=3)
     axes.set(xlabel=f"part of the mean tip error of {parts.total_mm:.2f} mm [mm]")

@@ -76,13 +76,7 @@ class Hold:
 
 
 class Drive:
-    """Drive of one arm.
-
-    Args:
-        arm: without pressure, as its driver gives it.
-        spec: the arm, for its rate and its sensors.
-        on_tick: takes the row of each tick.
-    """
+    """Drive of one arm, without pressure at first; `on_tick` takes the row of each tick."""
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
         self.on_tick = on_tick
@@ -97,14 +91,9 @@ class Drive:
     def to_rest(
         self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = SETTLE_TIMEOUT_S
     ) -> dict | None:
-        """Drive until the springs are at rest and the law has reached its target.
+        """Drive until the springs are at rest and the law has held its target for long enough.
 
         Motion capture that misses the arm at rest gets one more window.
-
-        Args:
-            law: spring lengths to pressures.
-            held: returns whether the arm has been at the target for long enough.
-            timeout_s: longest time.
 
         Returns:
             The row of the last tick; None after a timeout.
@@ -138,11 +127,9 @@ class Drive:
         self.n_lost = self.n_lost + 1 if lost.any() else 0
         known_m = None if lost.any() else spring_m
         try:
-            most = LOST_TICKS
-            if self.n_lost >= most:
-                raise ArmFault(
-                    f"sensors: got {self.n_lost} lost readings in a row, expected under {most}: {text}"
-                )
+            if self.n_lost >= LOST_TICKS:
+                got = f"got {self.n_lost} lost readings in a row, expected under {LOST_TICKS}"
+                raise ArmFault(f"sensors: {got}: {text}")
             pressure_kpa, arrived = law(known_m, self.link.pressure_kpa)
             self.link.write(pressure_kpa)
         finally:

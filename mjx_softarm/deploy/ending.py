@@ -21,7 +21,6 @@ DONE = 0
 MISSED = 1
 NOT_WRITTEN = 2
 FAULT = 3
-INTERRUPTED = 130
 _INTERRUPTS = {"drive": 0, "vent": 1, "save": 2}  # number of Ctrl-C so far that a step survives
 
 
@@ -45,16 +44,11 @@ class Ending(NamedTuple):
 def vent_at_end(
     body: Callable[[], Any], link: Link, tell: Callable[[str], Any], save: Callable[[], Any] = lambda: None
 ) -> Ending:
-    """Run `body`, then vent the arm and save the log, whatever happens.
+    """Run `body`, which drives the arm, then vent the arm and save the log, whatever happens.
 
     Any exception, Ctrl-C, SIGTERM and SIGHUP end the body. During venting and saving they are noted and
-    change nothing; only a second Ctrl-C ends the venting. Lines are printed last, since a terminal may block.
-
-    Args:
-        body: drives the arm.
-        link: the arm.
-        tell: takes a line for each error; its own exceptions are ignored.
-        save: writes the log.
+    change nothing; only a second Ctrl-C ends the venting. `tell` takes a line for each error, last, since a
+    terminal may block; its own exceptions are ignored.
     """
     finish = _Finish({"drive": body, "vent": link.vent, "save": save})
     with _signals(finish.on_signal):
@@ -150,9 +144,7 @@ def _signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
 
 
 def save_log(path: Path, log: Log) -> None:
-    """Write a log; if that fails, write it to the folder for temporary files.
-
-    The second file has the same format, or npz if the format was the reason.
+    """Write a log; if that fails, to the folder for temporary files, as npz if the format was the reason.
 
     Raises:
         OSError: the log could not be written to `path`; the message names the second file.

@@ -5,13 +5,13 @@ Only `n_goals` of them count for the run's exit status; of these, `n_taken` are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal
 
 import numpy as np
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.loop import LoopState, hold, release, with_goal
+from mjx_softarm.deploy.loop import LoopState, hold, refusals, release, with_goal
 from mjx_softarm.deploy.moving import lead_of, to_moving_goal
 from mjx_softarm.deploy.safety import Event
 from mjx_softarm.sensing.pose import pose_error
@@ -23,7 +23,7 @@ Order = Literal["vent", "hold"] | Sequence[np.ndarray] | None
 
 
 class ListedGoals:
-    """Goals one after the other, as `follow` takes them; goals in `refused`, by index, are skipped."""
+    """Goals one after the other, as `follow` takes them; those that no pressures reach are skipped."""
 
     ways: Sequence[slice] = ()  # rows of the log in which the goal moved
 
@@ -31,13 +31,12 @@ class ListedGoals:
         self,
         controller: Controller,
         goals: Iterable[np.ndarray],
-        refused: Mapping[int, Event],
-        duration_s: float | None = None,
+        duration_s: float = np.inf,
         stay: bool = False,
     ):
         self._controller = controller
         self._goals = list(goals)
-        self._refused = refused
+        self._refused = refusals(controller.policy, self._goals)  # now: it takes longer than a tick
         self._duration_s = duration_s
         self._stays = stay
         self._began_s = np.nan
@@ -56,34 +55,34 @@ class ListedGoals:
         Returns:
             The state with the goal of this tick, None where the run is over; refusals of goals.
         """
-        self._began_s = now_s if np.isnan(self._began_s) else self._began_s
+        if np.isnan(self._began_s):
+            self._began_s = now_s
         state, events = self.take_next(state)
-        over = self._duration_s is not None and now_s - self._began_s >= self._duration_s
         ended = state.goal is None and self.n_taken == len(self._goals)
-        over |= ended and not (self._stays and self._accepted)
+        over = ended and not (self._stays and self._accepted)
+        over |= now_s - self._began_s >= self._duration_s
         return None if over else state, events
 
     def take_next(self, state: LoopState) -> tuple[LoopState, Events]:
         """Return the state with the next accepted goal, if it has none, and the refusals until then."""
-        refusals = []
+        refused: Events = ()
         while state.goal is None and self.n_taken < len(self._goals):
             goal = self._goals[self.n_taken]
-            refusal = self._refused.get(self.n_taken)
+            if self.n_taken in self._refused:
+                refused += (self._refused[self.n_taken],)
+            else:
+                state, events = with_goal(self._controller, state, goal)
+                self._accepted |= not events
+                refused += events
             self.n_taken += 1
-            if refusal:
-                refusals.append(refusal)
-                continue
-            state, events = with_goal(self._controller, state, goal)
-            self._accepted |= not events
-            refusals += events
-        return state, tuple(refusals)
+        return state, refused
 
 
 class OrderedGoals(ListedGoals):
     """Goals that somebody orders; they are not counted, and only an exception of `orders` ends the run."""
 
     def __init__(self, controller: Controller, orders: Callable[[], Order]):
-        super().__init__(controller, (), {})
+        super().__init__(controller, ())
         self._orders = orders
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
@@ -113,13 +112,13 @@ class MovingGoal:
         goals: np.ndarray,
         stops: np.ndarray,
         pace_s: float,
-        refused: Mapping[int, Event],
     ):
         self._controller = controller
         self._poses = np.asarray(goals, float)
         self._pace_s = pace_s
-        self._lead_s, self._start_s = lead_of(controller)  # before the arm moves: it may take seconds
-        self._refused = refused
+        # Before the arm moves: both may take seconds
+        self._refused = refusals(controller.policy, list(goals))
+        self._lead_s, self._start_s = lead_of(controller)
         self._stops = np.union1d(np.flatnonzero(stops), [0, len(goals) - 1])
         self._began_s = 0.0
         self._leg = self._poses
@@ -159,7 +158,7 @@ class MovingGoal:
         return state._replace(goal=goal, ahead=ahead, strategy=strategy), ()
 
     def _stop(self, state: LoopState) -> tuple[LoopState | None, Events]:
-        """Return the state with the next stop as its goal; None where it is refused."""
+        """Return the state with the next stop as its goal, None where it is refused, and the refusal."""
         state, events = with_goal(self._controller, state, self._poses[self.n_taken - 1])
         return None if events else state, events
 

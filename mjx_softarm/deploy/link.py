@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +44,9 @@ class ArmFault(Exception):
 
 
 class Link:
-    """An arm without pressure at first.
+    """An arm without pressure at first, and a control loop of a period `dt_s`.
 
-    Args:
-        arm: the driver; `pressures`, `motion_capture` and `time_s` are used if it has them.
-        spec: the arm, for its numbers of springs and chambers.
-        dt_s: period of the control loop.
+    The driver's `pressures`, `motion_capture` and `time_s` are used if it has them.
     """
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, dt_s: float):
@@ -108,11 +105,10 @@ class Link:
         except TimeoutError as error:
             self._n_late += 1
             most = 2 * LATE_TICKS
-            if self._n_late > most:
-                raise ArmFault(
-                    f"write_pressures: got {self._n_late} late in a row, expected {most} at most"
-                ) from error
-            return False
+            if self._n_late <= most:
+                return False
+            got = f"got {self._n_late} late in a row, expected {most} at most"
+            raise ArmFault(f"write_pressures: {got}") from error
         self.pressure_kpa = pressure_kpa
         self._n_late = 0
         self._unsure = False  # last: a signal may come between these lines
@@ -153,9 +149,8 @@ class Link:
                 in_time, why = False, str(error)
             n_failed = 0 if in_time else n_failed + 1
             if n_failed == VENT_TRIES:
-                raise ArmFault(
-                    f"vent: got {n_failed} failed writes in a row, expected fewer; the last: {why}"
-                )
+                got = f"got {n_failed} failed writes in a row, expected fewer"
+                raise ArmFault(f"vent: {got}; the last: {why}")
             self.wait_until(begin_s + self._dt_s)
 
     def _frame(self) -> dict[str, np.ndarray]:
@@ -213,15 +208,6 @@ def first_frame(arm: Any, where: str) -> Capture:
     raise InputError(f"{where}: got {why}, expected a frame with the tip within {LOOKS * LOOK_S:g} s")
 
 
-def stacked(rows: Collection[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return the values (n, ...) of n rows by name; NaN where a row has none."""
-    shapes = {name: np.shape(value) for row in rows for name, value in row.items()}
-    return {
-        name: np.array([row.get(name, np.full(shape, np.nan)) for row in rows], float)
-        for name, shape in shapes.items()
-    }
-
-
 class Recorder:
     """Rows of a growing log; at most `kept` of the newest. Its length counts all rows."""
 
@@ -239,11 +225,15 @@ class Recorder:
 
     def last(self, n: int) -> list[dict[str, Any]]:
         """Return the last n rows."""
-        return [self._rows[k] for k in range(-min(n, len(self._rows)), 0)]
+        return list(self._rows)[-n:]
 
     def log(self, source: str, sensor: Sensor) -> Log:
         """Return the log so far, of an arm with this sensor; NaN for missing values."""
-        arrays = stacked(self._rows) or {"time_s": np.empty(0)}
+        shapes = {name: np.shape(value) for row in self._rows for name, value in row.items()}
+        arrays = {
+            name: np.array([row.get(name, np.full(shape, np.nan)) for row in self._rows], float)
+            for name, shape in ({"time_s": ()} | shapes).items()
+        }
         arrays["time_s"] = arrays["time_s"] - arrays["time_s"][:1]
         row = np.arange(2, len(self._rows) + 2)
         return Log(source=source, row=row, reading_name=sensor.reading_name, **arrays)

@@ -5,8 +5,7 @@
     belief, goal        -> references    if an action is due (`mjx_softarm.deploy.strategy`)
     belief, references  -> pressures     the sensor-space law (`mjx_softarm.control`)
 
-Belief, strategy and command are values, which `LoopState` holds side by side. Gains, limits, calibration,
-rate, tolerance and number of actions come from the policy file; heuristics are constants beside their use.
+Belief, strategy and command are values, which `LoopState` holds side by side.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ def step(
     Returns:
         The next state, and the faults; its pressures are to be written unless a fault ends the run.
     """
-    belief = believe(controller, state.belief, state.command, readings, late, measured_kpa)
+    belief = believe(state.belief, state.command, readings, late, measured_kpa)
     events = check(state.belief, belief)
     state = state._replace(belief=belief, arrived=False)
     if stop_of(events) is not None:
@@ -92,9 +91,8 @@ def _pressed(controller: Controller, command: Command, spring_m: np.ndarray) -> 
     law = command.law
     if np.isnan(law.length_m).any():  # these are the first lengths that were read
         law = LawState.at_rest(command.pressure_kpa, spring_m)
-    pressure_kpa, law = pressures(
-        command.reference_m, spring_m, law, controller.policy.gains, controller.dt_s
-    )
+    gains = controller.policy.gains
+    pressure_kpa, law = pressures(command.reference_m, spring_m, law, gains, controller.dt_s)
     return command._replace(pressure_kpa=pressure_kpa, law=law, n_ticks=command.n_ticks + 1)
 
 
@@ -146,15 +144,10 @@ def refusals(policy: Policy, goals: Sequence[np.ndarray]) -> dict[int, Event]:
     if not finite:
         return {}
     poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
-    return {
-        k: _unreachable(goals[k], pose)
-        for k, pose, error in zip(finite, poses, errors, strict=True)
-        if error > policy.reward.threshold or np.isnan(error)
-    }
-
-
-def _unreachable(goal: np.ndarray, pose: np.ndarray) -> Event:
-    """Return the refusal of a goal (6,) with its nearest pose (6,) [mm, deg]."""
-    got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goal, pose))
-    message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
-    return Event(Fault.GOAL_OUTSIDE, message)
+    refused = {}
+    for k, pose, error in zip(finite, poses, errors, strict=True):
+        if not error <= policy.reward.threshold:
+            got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
+            message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
+            refused[k] = Event(Fault.GOAL_OUTSIDE, message)
+    return refused

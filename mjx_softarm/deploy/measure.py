@@ -16,7 +16,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Fault
-from mjx_softarm.deploy.session import Arrival, LoopRun
+from mjx_softarm.deploy.session import LoopRun
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
@@ -29,14 +29,15 @@ GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll 
 
 
 class Accuracy(NamedTuple):
-    """Errors at p goals; NaN where a goal was missed."""
+    """Arm at rest on arrival at p goals, in the mean of a window; NaN where a goal was missed."""
 
     goal: np.ndarray  # (p, 6) [mm, deg]
-    error: np.ndarray  # (p, 6) [mm, deg] of the tip by motion capture
+    error: np.ndarray  # (p, 6) [mm, deg] of the tip by motion capture, NaN where it was not seen
     believed: np.ndarray  # (p, 6) [mm, deg] believed pose minus the goal
-    saturated: np.ndarray  # (p, n_chambers) bool: a chamber at its limit, off its reference, on arrival
-    arrival_s: np.ndarray  # (p,)
-    load_estimate_g: np.ndarray  # (p,) believed payload on arrival
+    spring_m: np.ndarray  # (p, n_springs) lengths read, NaN where none was
+    reference_m: np.ndarray  # (p, n_springs)
+    saturated: np.ndarray  # (p, n_chambers) bool: a chamber at its limit, off its reference
+    load_kg: np.ndarray  # (p,) believed payload
 
 
 def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
@@ -99,55 +100,30 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy
     """Return the accuracy of a run towards goals (p, 6) [mm, deg], on an arm with motion capture.
 
     Raises:
-        InputError: motion capture saw nothing, or no tick was logged.
-    """
-    policy = controller.policy
-    error, believed = np.full((2, *goals.shape), np.nan)
-    mask = np.zeros((len(goals), policy.spec.n_chambers), bool)
-    arrival_s, load_estimate_g = np.full((2, len(goals)), np.nan)
-    for arrival in run.arrivals:
-        point = arrival.index
-        rest = at_rest(run, controller, arrival)
-        error[point], mask[point], load_estimate_g[point] = rest.error, rest.saturated, 1e3 * rest.load_kg
-        believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
-        arrival_s[point] = run.log.time_s[arrival.row]
-    return Accuracy(goals, error, believed, mask, arrival_s, load_estimate_g)
-
-
-class Rest(NamedTuple):
-    """Arm at rest on arrival at a goal: means over the window that ends with it."""
-
-    error: np.ndarray  # (6,) [mm, deg] of the tip by motion capture, NaN where it was not seen
-    spring_m: np.ndarray  # (n_springs,) lengths read, NaN where none was
-    reference_m: np.ndarray  # (n_springs,)
-    load_kg: float  # believed payload
-    saturated: np.ndarray  # (n_chambers,) bool
-
-
-def at_rest(run: LoopRun, controller: Controller, arrival: Arrival) -> Rest:
-    """Return the arm at rest on an arrival of a run.
-
-    Raises:
-        InputError: motion capture saw nothing, or no tick was logged.
+        InputError: motion capture saw nothing.
     """
     log = run.log
     policy = controller.policy
-    if log.tip_m is None or log.tip_quaternion is None:
-        raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
-    assert log.pressure_kpa is not None and log.reference_m is not None
-    assert log.readings is not None and log.load_kg is not None
-    rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
-    spring_m = _finite_mean(policy.sensor.lengths(log.readings[rows], np.nan).length_m)
-    reference_m = log.reference_m[arrival.row]
-    law = policy.gains.measured()
-    mean_kpa = _finite_mean(log.pressure_kpa[rows])
-    return Rest(
-        seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal),
-        spring_m,
-        reference_m,
-        float(log.load_kg[arrival.row]),
-        saturated(mean_kpa, reference_m, spring_m, law, policy.tolerance_m),
-    )
+    error, believed = np.full((2, len(goals), 6), np.nan)
+    spring_m, reference_m = np.full((2, len(goals), policy.spec.n_springs), np.nan)
+    mask = np.zeros((len(goals), policy.spec.n_chambers), bool)
+    load_kg = np.full(len(goals), np.nan)
+    for arrival in run.arrivals:
+        if log.tip_m is None or log.tip_quaternion is None:
+            raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
+        assert log.pressure_kpa is not None and log.reference_m is not None
+        assert log.readings is not None and log.load_kg is not None
+        k = arrival.index
+        rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
+        error[k] = seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal)
+        believed[k] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
+        spring_m[k] = _finite_mean(policy.sensor.lengths(log.readings[rows], np.nan).length_m)
+        reference_m[k] = log.reference_m[arrival.row]
+        mean_kpa = _finite_mean(log.pressure_kpa[rows])
+        law = policy.gains.measured()
+        mask[k] = saturated(mean_kpa, reference_m[k], spring_m[k], law, policy.tolerance_m)
+        load_kg[k] = log.load_kg[arrival.row]
+    return Accuracy(goals, error, believed, spring_m, reference_m, mask, load_kg)
 
 
 def _finite_mean(values: np.ndarray) -> np.ndarray:
@@ -159,15 +135,10 @@ def _finite_mean(values: np.ndarray) -> np.ndarray:
 def figures(
     accuracy: Accuracy, events: Mapping[Fault, int], asked: Sequence[bool] = (True,) * 6
 ) -> dict[str, Any]:
-    """Return the figures of an accuracy, NaN if no goal was measured.
+    """Return the figures of an accuracy, with the number of events of each fault; NaN if none was measured.
 
     A goal is measured if the tip arrived and was seen, at any distance. Translation is the norm of the errors
     of x, y and z, rotation that of yaw, pitch and roll; both leave out axes that goals do not ask for.
-
-    Args:
-        accuracy: of a run.
-        events: number of events of each fault.
-        asked: which of x, y, z, yaw, pitch and roll goals ask for.
     """
     # Errors at the goals that were measured
     measured = np.isfinite(accuracy.error).all(axis=1)
@@ -192,7 +163,7 @@ def figures(
         "rotation_max_deg": float(turned.max()),
         **dict(zip(POSE_NAMES, np.where(asked, np.abs(error).mean(axis=0), np.nan).tolist(), strict=True)),
         "believed_mm": float(_norms(believed, asked)[0].mean()),
-        "load_estimate_g": float(accuracy.load_estimate_g[measured].mean()) if n_measured else np.nan,
+        "load_estimate_g": float((1e3 * accuracy.load_kg[measured]).mean()) if n_measured else np.nan,
         "saturated_points": int(np.count_nonzero(per_point)),
         "saturated_chambers_max": int(per_point.max()),
         "saturation_events": int(events.get(Fault.SATURATED, 0)),
@@ -211,14 +182,8 @@ Way = tuple[np.ndarray, np.ndarray]  # tips by motion capture, NaN where not see
 
 
 def ways_of(run: LoopRun) -> list[Way]:
-    """Return tips and goals of the ticks of each way on which the goal moved.
-
-    Raises:
-        InputError: motion capture saw nothing.
-    """
-    assert run.log.goal is not None
-    if run.log.tip_m is None:
-        raise InputError(f"motion capture: got no frame in {len(run.log)} ticks, expected the tip")
+    """Return tips and goals of the ticks of each way on which the goal moved; motion capture saw the tip."""
+    assert run.log.goal is not None and run.log.tip_m is not None
     return [(1e3 * run.log.tip_m[rows], run.log.goal[rows, :3]) for rows in run.ways]
 
 
@@ -229,7 +194,6 @@ def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
         Mean, 95 % and largest distance [mm] of tip and goal at the same time; the lag [s], up to
         `MOST_LAG_S`, with the least mean distance, and this mean.
     """
-    n = sum(len(goal) for _, goal in ways)
 
     def away_mm(lag: int) -> np.ndarray:
         each = [np.linalg.norm(tip[lag:] - goal[: len(goal) - lag], axis=1) for tip, goal in ways]
@@ -246,7 +210,7 @@ def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
         "way_max_mm": float(np.nanmax(now)),
         "lag_s": best * dt_s,
         "way_without_lag_mm": means[best],
-        "way_s": n * dt_s,
+        "way_s": len(now) * dt_s,
     }
 
 
@@ -276,15 +240,15 @@ def write_accuracy(
         return "no picture: matplotlib is not installed"
     figure = Figure(figsize=(10, 4), layout="constrained")
     above, side, shares = figure.subplots(1, 3)
-    seen = accuracy.goal[:, :3] + accuracy.error[:, :3]
+    off = accuracy.error[:, :3]
+    seen = accuracy.goal[:, :3] + off
     style = "."
     of_what = "goals"
-    off = accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3]
     if ways:
-        seen = np.concatenate([tip for tip, _ in ways])
+        seen, goal = (np.concatenate(positions) for positions in zip(*ways, strict=True))
+        off = seen - goal
         style = "-"
         of_what = "time"
-        off = seen - np.concatenate([goal for _, goal in ways])
     for axes, (i, j) in ((above, (0, 1)), (side, (0, 2))):
         axes.plot(accuracy.goal[:, i], accuracy.goal[:, j], "o", mfc="none", label="goal")
         axes.plot(seen[:, i], seen[:, j], style, label="measured")
@@ -313,12 +277,12 @@ def print_run(run: LoopRun, policy: Policy) -> None:
     if all(arrival.reached for arrival in run.arrivals):
         return
     reward = policy.reward
-    for largest, unit, other in (
-        (max(reward.weights[:3]), "mm", "rotation"),
-        (max(reward.weights[3:]), "deg", "position"),
+    for weights, unit, other in (
+        (reward.weights[:3], "mm", "rotation"),
+        (reward.weights[3:], "deg", "position"),
     ):
-        if largest:
-            within = f"{reward.threshold / largest:.2g} {unit}"
+        if any(weights):
+            within = f"{reward.threshold / max(weights):.2g} {unit}"
             print(f"a goal counts as reached within {within} if the {other} is exact")
     if not policy.calibrated:
         print(

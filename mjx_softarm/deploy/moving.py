@@ -56,11 +56,7 @@ class ShapeLag(NamedTuple):
     ) -> tuple[ShapeLag, np.ndarray]:
         """Return the memory a time dt_s later, and the pose (6,) [mm, deg] at rest minus that in motion.
 
-        Args:
-            policy: the arm.
-            spring_m (n_springs,) [m]: spring lengths then.
-            load_kg: payload.
-            dt_s: time since the last lengths.
+        Then the springs have lengths (n_springs,) [m], and the arm carries a payload.
         """
         # A shape without a lag is always that at rest
         if not policy.spec.shape_lag_s:
@@ -143,7 +139,7 @@ class Predicting(NamedTuple):
         """Act several times; the last references count."""
         # Lengths at the goal, of an arm whose shape lags and that has been beside its way
         controller = belief.controller
-        policy = belief.controller.policy
+        policy = controller.policy
         pose = belief.pose
         shift = self.shift
         length_m = belief.spring_m
@@ -179,9 +175,8 @@ class Chasing(NamedTuple):
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
         """Act from the pose in motion towards the goal, corrected by its error on the way."""
         controller = belief.controller
-        policy = belief.controller.policy
         load_kg = belief.load.believed_kg
-        shape, behind = self.shape.advance(policy, belief.spring_m, load_kg, controller.dt_s)
+        shape, behind = self.shape.advance(controller.policy, belief.spring_m, load_kg, controller.dt_s)
         pose = belief.pose - behind
         way = self.way.advance(goal, pose, controller)
 
@@ -189,7 +184,7 @@ class Chasing(NamedTuple):
         last_m = self.references_m or (belief.command.reference_m,)
         seen = observed(belief, last_m[0])
         reference_m = controller.plan(pose, goal + way.correction, belief.spring_m, seen)
-        n_ticks = max(1, round(policy.action_s / controller.dt_s))
+        n_ticks = max(1, round(controller.policy.action_s / controller.dt_s))
         return Chasing(way, (*last_m, reference_m)[-n_ticks:], shape), reference_m, ()
 
 
@@ -233,9 +228,8 @@ def tip_lag_s(controller: Controller) -> float:
     for _ in range(_N_SWINGS):
         shares = 0.5 + _SWING * rng.uniform(-1.0, 1.0, (2, policy.spec.n_chambers))
         ends_kpa = low + (high - low) * shares
-        first, last = (
-            _pose(policy, spring_m) for spring_m in expected_springs(policy.spring_model, ends_kpa)
-        )
+        ends_m = expected_springs(policy.spring_model, ends_kpa)
+        first, last = (_pose(policy, spring_m) for spring_m in ends_m)
         swing = pose_error(last, first)
         goals = first + 0.5 * (1.0 - np.cos(phase))[:, None] * swing
         along = _tip_path(controller, ends_kpa[0], goals) @ swing[:3]
@@ -252,7 +246,7 @@ def _tip_path(controller: Controller, pressure_kpa: np.ndarray, goals: np.ndarra
     """
     # The arm at rest
     policy = controller.policy
-    spec = controller.policy.spec
+    spec = policy.spec
     dt_s = controller.dt_s
     straight_m = spec.at_chambers(spec.geometry.section_length_m)
     air = spec.pneumatics(straight_m, dt_s)

@@ -47,9 +47,7 @@ ACCURACY = (
     "for comparison, the paper's arm, simulated: "
     "its circle at 0.4 to 1.2 mm after 60 poses, at 0.4 to 0.7 after 150"
 )
-LENGTHS = np.geomspace(
-    1.0, 30.0, 6
-)  # length scales of the process that are tried, in deviations of the springs
+LENGTHS = np.geomspace(1.0, 30.0, 6)  # length scales that are tried, in deviations of the springs
 NOISE = 0.05  # deviation of a tip's noise, in that of the process
 
 
@@ -80,16 +78,17 @@ def record(
         save: writes the log, if it has rows, once the arm is vented.
     """
     rows = Recorder()
-    hold = _Hold()
-    rest = []
+    rest = []  # whether each pose was seen at rest
     poses = []  # spring lengths and tip [m] of each pose with both
-    error_mm, n_enough = np.nan, 0
+    error_mm = np.nan
+    n_enough = 0
 
     def on_tick(row: dict) -> None:
-        hold.add(row, "tip_m" in row or not drive.link.sees)
+        hold.add(row)
         rows.add(row)
 
     drive = Drive(arm, spec, on_tick)
+    hold = _Hold(drive)
     step_kpa = STEP_SHARE * (spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa)
     began_s = reported_s = time.monotonic()
 
@@ -100,10 +99,10 @@ def record(
             hold.ticks.clear()
             law = ramp(target_kpa, drive.dt_s, step_kpa)
             rest.append(drive.to_rest(law, hold.is_long, TIMEOUT_S) is not None)
-            hold.check(drive, target_kpa if rest[-1] else None)
+            hold.check(target_kpa if rest[-1] else None)
 
             # Predict each tip from the other poses; end where more poses bring nothing.
-            if rest[-1] and np.isfinite(pose := hold.pose(drive)).all():
+            if rest[-1] and np.isfinite(pose := hold.pose()).all():
                 poses.append(pose)
                 if MIN_POSES <= len(poses) <= MOST_POSES and len(poses) % CHECK_POSES == 0:
                     half_mm, error_mm = prediction_errors_mm(np.array(poses), spec)
@@ -113,10 +112,9 @@ def record(
             now_s = time.monotonic()
             if n_enough > 1 or now_s - reported_s >= PROGRESS_S or k == len(targets_kpa):
                 left_min = (now_s - began_s) / k * (len(targets_kpa) - k) / 60
-                known = (
-                    "" if np.isnan(error_mm) else f"; each is predicted from the others to {error_mm:.1f} mm"
-                )
-                tell(f"{k} of {len(targets_kpa)} poses, about {left_min:.1f} min left{known}")
+                line = f"{k} of {len(targets_kpa)} poses, about {left_min:.1f} min left"
+                known = f"; each is predicted from the others to {error_mm:.1f} mm"
+                tell(line if np.isnan(error_mm) else line + known)
                 reported_s = now_s
             if n_enough > 1:
                 tell("half of them predict as well: more poses bring nothing")
@@ -163,14 +161,16 @@ def prediction_errors_mm(poses: np.ndarray, spec: ArmSpec) -> tuple[float, float
 class _Hold:
     """Rows at one set of pressures, cut as calibration cuts holds out of a log of all ticks."""
 
-    def __init__(self) -> None:
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
         self.rows: list[dict[str, Any]] = []
         self.ticks: list[dict[str, Any]] = []  # all rows of this pose, the ramp's too
         self._n_unseen = 0  # poses in a row without a frame of motion capture
 
-    def add(self, row: dict[str, Any], seen: bool) -> None:
-        """Take the row of a tick; `seen` is False where motion capture missed the tip."""
+    def add(self, row: dict[str, Any]) -> None:
+        """Take the row of a tick."""
         self.ticks.append(row)
+        seen = "tip_m" in row or not self._drive.link.sees
         if not seen or not all(np.isfinite(row[name]).all() for name in NEEDED if name in row):
             return  # calibration leaves out such rows, too
         if self.rows and leaves(row["pressure_kpa"], self.rows[0]["pressure_kpa"]):
@@ -178,16 +178,19 @@ class _Hold:
         self.rows.append(row)
 
     def last_second(self) -> list[dict[str, Any]]:
-        """Return the rows of the last second."""
         since_s = self.rows[-1]["time_s"] - WINDOW_S - ROUNDING_S
         return [row for row in self.rows if row["time_s"] >= since_s]
 
-    def pose(self, drive: Drive) -> np.ndarray:
+    def spring_m(self, rows: list[dict[str, Any]]) -> np.ndarray:
+        """Return the lengths (k, n_springs) [m] of rows, NaN where a reading was lost."""
+        readings = np.array([row["readings"] for row in rows])
+        return self._drive.sensor.lengths(readings, np.nan).length_m
+
+    def pose(self) -> np.ndarray:
         """Return spring lengths and tip (n_springs + 3,) [m] at the end of a hold; NaN where unknown."""
         rows = self.last_second()
-        readings = np.array([row["readings"] for row in rows])
         tip_m = np.array([row.get("tip_m", np.full(3, np.nan)) for row in rows])
-        return np.append(drive.sensor.lengths(readings, np.nan).length_m.mean(axis=0), tip_m.mean(axis=0))
+        return np.append(self.spring_m(rows).mean(axis=0), tip_m.mean(axis=0))
 
     def is_long(self) -> bool:
         """Return whether the hold has been long enough and the tip is at rest."""
@@ -199,31 +202,30 @@ class _Hold:
             return True
         return not moves(*(np.array([row[name] for row in rows]) for name in ("time_s", "tip_m")))
 
-    def check(self, drive: Drive, target_kpa: np.ndarray | None) -> None:
-        """Check sensors and chambers by the rows of a pose.
+    def check(self, target_kpa: np.ndarray | None) -> None:
+        """Check sensors and chambers by the rows of a pose; its pressures if it was seen at rest.
 
         Raises:
             ArmFault: a sensor stood stock-still, a chamber at rest lacks its pressure, or motion capture is
                 gone.
         """
         # Motion capture
-        unseen = drive.link.sees and not any("tip_m" in row for row in self.ticks)
+        unseen = self._drive.link.sees and not any("tip_m" in row for row in self.ticks)
         self._n_unseen = self._n_unseen + 1 if unseen else 0
         if self._n_unseen >= UNSEEN_POSES:
             raise ArmFault(f"motion_capture: got no frame in {UNSEEN_POSES} poses, expected the tip in each")
 
         # Sensors and chambers
         kpa = np.array([row["pressure_kpa"] for row in self.ticks])
-        readings = np.array([row["readings"] for row in self.ticks])
-        spring_m = drive.sensor.lengths(readings, np.nan).length_m
-        stuck = np.flatnonzero(stuck_springs(spring_m, kpa, drive.spec.structure.n_sections))
+        n_sections = self._drive.spec.structure.n_sections
+        stuck = np.flatnonzero(stuck_springs(self.spring_m(self.ticks), kpa, n_sections))
         if stuck.size:
             raise ArmFault(f"spring{stuck[0]}: got the same reading always, expected one that changes")
         if target_kpa is None:
             return
         least_kpa = np.maximum(STUCK_PRESSURE_KPA, LOST_SHARE * np.abs(target_kpa))
-        off = np.abs(kpa[-1] - target_kpa) > least_kpa
-        if (k := np.flatnonzero(off)).size:
-            got = kpa[-1, k[0]]
-            wanted = target_kpa[k[0]]
-            raise ArmFault(f"pressures: chamber{k[0]}: got {got:.1f} kPa at rest, expected {wanted:.1f} kPa")
+        off = np.flatnonzero(np.abs(kpa[-1] - target_kpa) > least_kpa)
+        if off.size:
+            k = off[0]
+            text = f"got {kpa[-1, k]:.1f} kPa at rest, expected {target_kpa[k]:.1f} kPa"
+            raise ArmFault(f"pressures: chamber{k}: {text}")

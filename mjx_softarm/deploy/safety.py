@@ -97,12 +97,8 @@ class Event(NamedTuple):
     fault: Fault
     message: str
 
-    @property
-    def response(self) -> Response:
-        return self.fault.response
-
     def __str__(self) -> str:
-        return f"{self.fault.value}: {self.message} -> {self.response.value}"
+        return f"{self.fault.value}: {self.message} -> {self.fault.response.value}"
 
 
 def check(last: Belief, belief: Belief) -> tuple[Event, ...]:
@@ -115,7 +111,7 @@ def check(last: Belief, belief: Belief) -> tuple[Event, ...]:
 
 def stop_of(events: Iterable[Event]) -> Event | None:
     """Return the first event that ends a run, if there is one."""
-    return next((event for event in events if event.response is Response.VENT), None)
+    return next((event for event in events if event.fault.response is Response.VENT), None)
 
 
 def _timing_faults(belief: Belief) -> Iterator[Event]:
@@ -134,9 +130,9 @@ def _sensor_faults(belief: Belief) -> Iterator[Event]:
         yield Event(Fault.SENSOR_LOST, f"{names('spring', gone)}: no length in {LOST_TICKS} ticks in a row")
     elif belief.stuck.any():
         window_s = belief.controller.window * belief.controller.dt_s
-        text = f"{names('spring', belief.stuck)}: moved less than {1e3 * STUCK_RANGE_M:g} mm in "
-        text += f"{window_s:g} s, noise included, while the chamber was driven or the section moved"
-        yield Event(Fault.SENSOR_STUCK, text)
+        moved = f"moved less than {1e3 * STUCK_RANGE_M:g} mm in {window_s:g} s, noise included"
+        why = "while the chamber was driven or the section moved"
+        yield Event(Fault.SENSOR_STUCK, f"{names('spring', belief.stuck)}: {moved}, {why}")
 
 
 def _chamber_faults(belief: Belief) -> Iterator[Event]:
@@ -144,9 +140,9 @@ def _chamber_faults(belief: Belief) -> Iterator[Event]:
     lost = belief.n_suspect >= n_windows * belief.controller.window
     if lost.any():
         kpa = ", ".join(f"{value:.1f}" for value in belief.command.pressure_kpa[lost])
-        text = f"{names('chamber', lost)}: at {kpa} kPa, but the arm has the shape it would have without that"
-        supply = ": is the supply of air on?" * bool(np.count_nonzero(lost) > 1)
-        yield Event(Fault.CHAMBER_LOST, f"{text} pressure{supply}")
+        shape = "but the arm has the shape it would have without that pressure"
+        supply = ": is the supply of air on?" if np.count_nonzero(lost) > 1 else ""
+        yield Event(Fault.CHAMBER_LOST, f"{names('chamber', lost)}: at {kpa} kPa, {shape}{supply}")
 
 
 def _payload_faults(last: Belief, belief: Belief) -> Iterator[Event]:
@@ -182,20 +178,19 @@ def extrapolated(belief: Belief) -> tuple[Event, ...]:
 def unsettled(belief: Belief) -> tuple[Event, ...]:
     """Return the faults of the springs as they stand before the next action."""
     # Errors at the chambers: springs of an arm with redundant chambers cannot all be on any references
-    controller = belief.controller
-    command = belief.command
-    mask = belief.saturated
-    events = []
-    off_m = belief.mean_m - command.reference_m
-    allocation = controller.policy.gains.allocation
+    off_m = belief.mean_m - belief.command.reference_m
+    kind = "spring"
+    allocation = belief.controller.policy.gains.allocation
     if allocation is not None:
-        off_m = -allocated_error(-off_m, command.pressure_kpa, allocation)
+        off_m = -allocated_error(-off_m, belief.command.pressure_kpa, allocation)
+        kind = "chamber"
 
+    events = []
+    mask = belief.saturated
     if not belief.settled:
         worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
-        where = f"{'spring' if allocation is None else 'chamber'}{worst}"
-        text = f"after {SETTLE_TIMEOUT_S:g} s, {where} is {1e3 * off_m[worst]:+.1f} mm"
-        events.append(Event(Fault.NOT_SETTLED, f"{text} off its reference"))
+        off = f"{kind}{worst} is {1e3 * off_m[worst]:+.1f} mm off its reference"
+        events.append(Event(Fault.NOT_SETTLED, f"after {SETTLE_TIMEOUT_S:g} s, {off}"))
     if mask.any():
         off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
         text = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"

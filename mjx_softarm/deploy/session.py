@@ -18,7 +18,7 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import DONE, MISSED, Ending, vent_at_end
 from mjx_softarm.deploy.goals import ListedGoals, MovingGoal, Order, OrderedGoals
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import LoopState, in_force, refusals, start, step
+from mjx_softarm.deploy.loop import LoopState, in_force, start, step
 from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, stop_of
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import weighted_error
@@ -67,7 +67,7 @@ def follow(
     arm: ArmIO,
     controller: Controller,
     goals: Iterable[np.ndarray],
-    duration_s: float | None = None,
+    duration_s: float = np.inf,
     tell: Callable[[str], None] = lambda text: None,
     arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
@@ -85,10 +85,8 @@ def follow(
         save: writes the log, once the arm is vented.
         stay: hold the last goal until `duration_s` or something else ends the run.
     """
-    goals = list(goals)
-    refused = refusals(controller.policy, goals)  # before the arm moves: it takes longer than a tick
-    source = ListedGoals(controller, goals, refused, duration_s, stay)
-    return _Session(arm, controller, source, tell, arrived).to_end(save)
+    listed = ListedGoals(controller, goals, duration_s, stay)
+    return _Session(arm, controller, listed, tell, arrived).to_end(save)
 
 
 def trace(
@@ -111,8 +109,7 @@ def trace(
         stops (p,): bool; the first and the last goal are stops in any case.
         tell, arrived, save: as for `follow`; stops are the goals that count.
     """
-    refused = refusals(controller.policy, list(goals))
-    goal = MovingGoal(controller, goals, np.broadcast_to(stops, len(goals)), pace_s, refused)
+    goal = MovingGoal(controller, goals, np.broadcast_to(stops, len(goals)), pace_s)
     return _Session(arm, controller, goal, tell, arrived).to_end(save)
 
 
@@ -189,29 +186,35 @@ class _Session:
         if not self.link.measures:
             self.tell("payload: estimated from the commanded pressures, since the arm measures none")
         try:
-            while True:
-                begin_s = self.link.now()
-                state, refused = self.goals.advance(self.state, begin_s, len(self.rows))
-                if refused:
-                    self._note(refused)
-                if state is None:
-                    return
-                self.state = state
-                in_time = self._tick(begin_s)
-                self.late = not in_time or self.link.now() - begin_s > self.controller.dt_s + _ROUNDING_S
-                self.link.wait_until(begin_s + self.controller.dt_s)
-        except _Stopped:
-            raise
+            stop = self._ticks()
         except ArmFault as error:
             self.events.append(Event(Fault.ARM_LOST, str(error)))
             raise
+        if stop is not None:
+            raise ArmFault(self._stamped(f"{stop.fault.value}: {stop.message}"))
+
+    def _ticks(self) -> Event | None:
+        """Take ticks until the goals are over; return the event that ends the run before."""
+        dt_s = self.controller.dt_s
+        while True:
+            begin_s = self.link.now()
+            state, refused = self.goals.advance(self.state, begin_s, len(self.rows))
+            if refused:
+                self._note(refused)
+            if state is None:
+                return None
+            self.state = state
+            stop, in_time = self._tick(begin_s)
+            if stop is not None:
+                return stop
+            self.late = not in_time or self.link.now() - begin_s > dt_s + _ROUNDING_S
+            self.link.wait_until(begin_s + dt_s)
 
     def log(self) -> Log:
-        """Return the log so far."""
         return self.rows.log("run", self.controller.policy.sensor)
 
-    def _tick(self, begin_s: float) -> bool:
-        """Return whether the arm took the pressures in time."""
+    def _tick(self, begin_s: float) -> tuple[Event | None, bool]:
+        """Return the event that ends the run, and whether the arm took the pressures in time."""
         # Read the arm.
         goal = self.state.goal
         readings = self.link.read()
@@ -239,9 +242,7 @@ class _Session:
             if self.state.arrived:
                 self._arrive(row["goal"], row["estimate"])
             self.look(self.state, row)
-        if stop is not None:
-            raise _Stopped(self._stamped(f"{stop.fault.value}: {stop.message}"))
-        return in_time
+        return stop, in_time
 
     def _log(self, row: dict[str, Any]) -> None:
         belief = self.state.belief
@@ -256,16 +257,22 @@ class _Session:
         Faults of the payload last until it is next estimated; `estimated` says whether it was.
         """
         for event in events:
-            if event.fault not in self.last and event.response is not Response.VENT:
+            if event.fault not in self.last and event.fault.response is not Response.VENT:
                 self.tell(self._stamped(event))
         lasting = set() if estimated else self.last & PAYLOAD_FAULTS
         self.last = lasting | {event.fault for event in events}
         self.events.extend(events)
 
     def _arrive(self, goal: np.ndarray, estimate: np.ndarray) -> None:
-        error, how = self._seen_error(goal), "motion capture"
+        # The error by motion capture over the window of rest, or else by the springs
+        rows = self.rows.last(self.controller.window)
+        tip_m = np.array([row.get("tip_m", np.full(3, np.nan)) for row in rows])
+        quaternion = np.array([row.get("tip_quaternion", np.full(4, np.nan)) for row in rows])
+        error, how = seen_error(tip_m, quaternion, goal), "motion capture"
         if np.isnan(error).any():
             error, how = pose_error(np.asarray(estimate, float), goal), "the springs"
+
+        # Whether it is within what the goal allows
         reward = self.controller.policy.reward
         share = float(weighted_error(goal + error, goal, reward)) / reward.threshold
         reached = share < 1.0
@@ -278,17 +285,5 @@ class _Session:
         self.tell(self._stamped(f"goal {len(self.arrivals)}: {off}{missed}"))
         self.arrived(self.goals.n_taken - 1)
 
-    def _seen_error(self, goal: np.ndarray) -> np.ndarray:
-        """Return the error (6,) [mm, deg] by motion capture over the window of rest, NaN without."""
-        rows = [row for row in self.rows.last(self.controller.window) if "tip_m" in row]
-        if not rows:
-            return np.full(6, np.nan)
-        tip_m, quaternion = (np.array([row[name] for row in rows]) for name in ("tip_m", "tip_quaternion"))
-        return seen_error(tip_m, quaternion, goal)
-
     def _stamped(self, text: object) -> str:
         return f"{len(self.rows) * self.controller.dt_s:.2f} s: {text}"
-
-
-class _Stopped(ArmFault):
-    """A fault that ends the run and is counted already."""

@@ -74,11 +74,18 @@ class AtRest(NamedTuple):
         if self.n_actions == policy.n_actions:
             return None, None, events
 
-        # Shifts that take all, or a share, of the error that the references leave.
+        # Shifts that take all, or a share, of the error that the references leave. The payload's deflection
+        # is compensated once: by the next action of a policy that observes the payload, else by the shift.
+        # So for such a policy the error is estimated with the payload of its last action.
         shifts = [self.shift]
         allowed = None
         if belief.settled:
-            pose, left = _remaining_error(self, belief, goal)
+            reference_m = belief.command.reference_m
+            assert reference_m is not None and self.acted_load is not None
+            pose = acted = _pose_made(belief, reference_m, belief.load)
+            if belief.controller.observes_payload:
+                acted = _pose_made(belief, reference_m, self.acted_load)
+            left = asked_error(acted, goal, policy.reward)
             shifts = [clipped(self.shift - share * left) for share in SHARES]
             allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
         return self._act(belief, goal, shifts, events, allowed)
@@ -148,7 +155,7 @@ def observed(belief: Belief, last_m: np.ndarray | None = None) -> np.ndarray | N
     `last_m` (n_springs,) [m] are the last references, by default those in force.
     """
     controller = belief.controller
-    lengths_m = belief.window.spring_m
+    lengths_m = belief.window_m
     last_m = belief.command.reference_m if last_m is None else last_m
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
     last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
@@ -164,7 +171,7 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
     that would leave the least count.
     """
     controller = belief.controller
-    policy = belief.controller.policy
+    policy = controller.policy
     seen = observed(belief)
     shift = np.zeros(6)
     least = np.inf
@@ -178,20 +185,6 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
         left = asked_error(pose, goal, policy.reward)
         shift = clipped(shift - CORRECTION_SHARE * left)
     return best_m
-
-
-def _remaining_error(strategy: AtRest, belief: Belief, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose (6,) that the references make, and the error (6,) [mm, deg] that a shift is to correct.
-
-    The payload's deflection is compensated once: by the policy's next action if it observes the payload, else
-    by the shift. So the error of a policy that observes it is estimated with the payload of its last action.
-    """
-    reference_m = belief.command.reference_m
-    assert reference_m is not None and strategy.acted_load is not None
-    pose = acted = _pose_made(belief, reference_m, belief.load)
-    if belief.controller.observes_payload:
-        acted = _pose_made(belief, reference_m, strategy.acted_load)
-    return pose, asked_error(acted, goal, belief.controller.policy.reward)
 
 
 def _pose_made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:

@@ -82,7 +82,7 @@ class TakenPoses:
         # The arm must be at rest, with all readings, no chamber saturated.
         policy, belief, command = self._policy, state.belief, state.command
         low, high = np.sort(policy.actions[1:], axis=0)
-        if command.reference_m is None or state.goal is not None or not still(belief.window.spring_m):
+        if command.reference_m is None or state.goal is not None or not still(belief.window_m):
             return "got an arm that moves or has no pressure, expected one at rest"
         if belief.lost.any() or not np.isfinite(pose).all():
             return f"spring {np.argmax(belief.lost)}: got no reading, expected one"

@@ -104,13 +104,18 @@ def test_a_way_with_a_goal_out_of_reach_is_not_begun():
     np.testing.assert_array_equal(arm.written, 0.0)
 
 
-def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
-    arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
-    run = trace(arm, Controller.of(POLICY, between), goals, pace_s=10.0)
-    assert run.status == 0 and [arrival.goal.tolist() for arrival in run.arrivals] == goals.tolist()
-    goal = run.log.goal[run.ways[0]]
-    assert len(goal) in (500, 501)
-    np.testing.assert_allclose(goal[250], on_the_way(goals, 0.5), atol=1e-6)
+def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
+    there = []
+    goals = on_the_way(GOALS[:2], 0.0) + np.linspace(0.0, 1.0, 6)[:, None] * pose_error(GOALS[1], GOALS[0])
+    controller = Controller.of(POLICY, between)
+    run = trace(LinearArm(), controller, goals, 1.0, stops=np.arange(6) == 3, arrived=there.append)
+    assert there == [0, 3, 5] == [arrival.index for arrival in run.arrivals]
+    assert run.ending.status == 0 and run.n_goals == 3
+    assert run.arrivals[0].reached and run.arrivals[2].reached
+    np.testing.assert_allclose([arrival.goal for arrival in run.arrivals], goals[there])
+    lasted = [rows.stop - rows.start for rows in run.ways]
+    np.testing.assert_allclose(lasted, [150, 100], atol=1)
+    np.testing.assert_allclose(run.log.goal[run.ways[1]][50], goals[4], atol=1e-6)
     # The references leave the stop before the goal does
     early = run.log.reference_m[run.ways[0].start - 2] - run.log.reference_m[run.arrivals[0].row]
     assert np.abs(early).max() > 1e-3
@@ -154,20 +159,6 @@ def test_a_policy_of_motion_is_given_a_goal_ahead_by_its_own_lag(uncorrected, mo
         np.testing.assert_allclose(POLICY.actions.lengths(sensed[-9:]), then_m, atol=1e-5)
     ahead = on_the_way(goals, ((tick - begun) * DT_S + lead_s) / 10.0)
     np.testing.assert_allclose(goal, ahead, atol=0.003 * np.max(np.abs(goals[1] - goals[0])))  # a tick apart
-
-
-def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
-    arm, there = LinearArm(), []
-    goals = on_the_way(GOALS[:2], 0.0) + np.linspace(0.0, 1.0, 6)[:, None] * pose_error(GOALS[1], GOALS[0])
-
-    run = trace(
-        arm, Controller.of(POLICY, between), goals, pace_s=1.0, stops=np.arange(6) == 3, arrived=there.append
-    )
-    assert there == [0, 3, 5] == [arrival.index for arrival in run.arrivals]
-    assert run.ending.status == 0 and run.n_goals == 3
-    lasted = [rows.stop - rows.start for rows in run.ways]
-    np.testing.assert_allclose(lasted, [150, 100], atol=1)
-    np.testing.assert_allclose(run.log.goal[run.ways[1]][50], goals[4], atol=1e-6)
 
 
 def test_log_has_pressures_in_force_and_calibration_reads_it(tmp_path):

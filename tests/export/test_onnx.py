@@ -119,7 +119,7 @@ def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
             break
     assert before.strategy.n_actions == 1 and state.strategy.n_actions == 2
     seen_m = controller.policy.sensor.lengths(controller.policy.sensor.readings(swing_m)).length_m
-    at = len(before.belief.window.spring_m)
+    at = len(before.belief.window_m)
     motion = {"before_m": seen_m[at - 5], "last_reference_m": before.command.reference_m}
     feed = {"readings": readings, "goal": goal, "integral_kpa": before.command.law.integral_kpa} | motion
     feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}

@@ -18,9 +18,9 @@ POSE = np.array([20.0, -10.0, -600.0, 0.0, 5.0, 0.0])
 def held(window_m=REST_M, lost=False, goal=None, **command):
     """A state of the loop that holds its springs."""
     state, spring_m = start(CONTROLLER), np.full(N, REST_M)
-    window = state.belief.window._replace(spring_m=np.full((CONTROLLER.window, N), window_m))
+    window_m = np.full((CONTROLLER.window, N), window_m)
     belief = dataclasses.replace(
-        state.belief, spring_m=spring_m, window=window, n_lost=np.zeros(N, int) + lost
+        state.belief, spring_m=spring_m, window_m=window_m, n_lost=np.zeros(N, int) + lost
     )
     command = state.command._replace(**({"reference_m": spring_m} | command))
     return state._replace(belief=belief, command=command, goal=goal)

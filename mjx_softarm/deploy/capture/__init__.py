@@ -14,7 +14,7 @@ the few millimetres and degrees that remain.
 The loop takes the newest frame of each tick and never waits for one. A frame is missed, which is a gap in the
 log, where none is new, it is late, it is the first after a second without any, or a body is not seen in it.
 The base does not move, so it keeps the place at which it was last seen. Frames are logged with the tick that
-takes them, not shifted by their latency.
+takes them, not shifted by their age.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.capture.natnet import NatNet
 from mjx_softarm.deploy.capture.qualisys import Qualisys
-from mjx_softarm.deploy.capture.system import UP, CaptureFrame, CaptureName, Source
+from mjx_softarm.deploy.capture.system import UP, CaptureFrame, CaptureName
 from mjx_softarm.deploy.link import describe, first_frame
 from mjx_softarm.posture import straight_pose
 from mjx_softarm.sensing.pose import (
@@ -74,14 +74,10 @@ class Delay:
 class CapturedArm:
     """An arm whose motion capture is a system in the network; all else is the arm's own driver's.
 
-    Args:
-        arm: the driver.
-        source: connection to the system.
-        name: which bodies and axes count.
-        tell: takes a line when the tip is lost for `LOST_S`, and when it is seen again.
+    `tell` takes a line when the tip is lost for `LOST_S`, and when it is seen again.
     """
 
-    def __init__(self, arm: Any, source: Source, name: CaptureName, tell: Callable[[str], None]):
+    def __init__(self, arm: Any, source: NatNet | Qualisys, name: CaptureName, tell: Callable[[str], None]):
         self._arm = arm
         self._source = source
         self._name = name
@@ -92,8 +88,7 @@ class CapturedArm:
         self._polled_s = -np.inf  # time of the last frame, whatever it shows
         self._base: tuple[np.ndarray, np.ndarray] | None = None if name.base else (np.zeros(3), np.eye(3))
         self._n_asked = 0
-        self._latency_s = []
-        self._delay_s = []
+        self._delay_s: list[float] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._arm, name)
@@ -123,11 +118,8 @@ class CapturedArm:
         """End the connection; return a line about the frames."""
         self._source.close()
         line = f"motion capture: the tip was seen in {len(self._delay_s)} of {self._n_asked} ticks"
-        if not self._delay_s:
-            return line
-        known = np.array(self._latency_s)[np.isfinite(self._latency_s)]
-        sent = f"frames were sent {1e3 * known.mean():.1f} ms after the exposure, " if len(known) else ""
-        return f"{line}; {sent}at most {1e3 * max(self._delay_s):.0f} ms later than the fastest"
+        late = f"; at most {1e3 * max(self._delay_s):.0f} ms later than the fastest" if self._delay_s else ""
+        return line + late
 
     def _newest(self) -> CaptureFrame | None:
         """Return the newest frame since the last call; None without one, or if it may be an old one."""
@@ -162,7 +154,6 @@ class CapturedArm:
         # From the system's frame to the base's, then from its axes to ours
         (base_m, base_axes), (tip_m, tip_axes), up = self._base, frame.bodies[name.body], UP[name.up]
         turned = up @ base_axes.T
-        self._latency_s.append(frame.latency_s)
         self._delay_s.append(delay_s)
         return Capture(
             tip_m=turned @ (tip_m - base_m),
@@ -172,13 +163,7 @@ class CapturedArm:
 
 
 def with_capture(arm: Any, name: str | None, spec: ArmSpec, tell: Callable[[str], None]) -> Any:
-    """Return the arm with motion capture by name, or the arm itself without a name.
-
-    Args:
-        arm: the driver, without pressure.
-        name: `natnet:HOST:BODY` or `qualisys:HOST:BODY`, with options.
-        spec: the arm, for the place where its tip should be seen.
-        tell: takes lines about lost and found bodies.
+    """Return an arm without pressure with motion capture by the name of `--capture`; None: the arm itself.
 
     Raises:
         InputError: the name is malformed, the system cannot be reached, has no such body, does not see it,
@@ -189,9 +174,7 @@ def with_capture(arm: Any, name: str | None, spec: ArmSpec, tell: Callable[[str]
     read = CaptureName.read(name)
     where = f"--capture {name}"
     if hasattr(arm, "motion_capture"):
-        raise InputError(
-            f"--capture: got {name} and an arm with its own motion capture, expected one of them"
-        )
+        raise InputError(f"{where}: got an arm with its own motion capture, expected one of the two")
     try:
         source = _KINDS[read.system](read)
     except OSError as error:

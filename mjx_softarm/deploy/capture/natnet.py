@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-import math
 import socket
 import struct
 import time
@@ -34,7 +33,7 @@ class _Enough(Exception):
 
 
 class NatNet:
-    """Connection to a NatNet server; see `Source`.
+    """Connection to a NatNet server.
 
     Raises:
         InputError: the package is missing, or the server has no such body or marker set.
@@ -48,11 +47,14 @@ class NatNet:
         self._host = socket.gethostbyname(name.host)  # looked up once: the package sends at each poll
         self._new: list[Any] = []  # frames that have come since the last poll
         self._described: Any = None  # None while the server is asked, and its bodies' numbers are not known
-        self._first: Any = None  # the first frame's end, for the rate of the server's clock
         self._asked_s = time.monotonic()
         for multicast in (False, True):
             self._client = self._connect(multicast)
-            if self._until(lambda: self._described and self._new):
+            end_s = time.monotonic() + WAIT_S
+            while not (self._described and self._new) and time.monotonic() < end_s:
+                self._read()
+                time.sleep(0.01)
+            if self._described and self._new:
                 break
             self._client.shutdown()
         else:
@@ -69,7 +71,11 @@ class NatNet:
         self._n_markers = sets.get(name.markers, 0)
 
     def poll(self) -> CaptureFrame | None:
-        """Return the newest frame since the last call, None without one, at once; see `Source`."""
+        """Return the newest frame since the last call, None without one, at once.
+
+        Raises:
+            OSError: a packet cannot be read, or the network is gone.
+        """
         self._read()
         frame = self._new[-1] if self._new else None
         now_s = time.monotonic()
@@ -78,7 +84,6 @@ class NatNet:
         if now_s - self._asked_s > AGAIN_S:
             self._asked_s = now_s
             self._described = None
-            self._first = None
             self._client.send_request(self._client.NAT_CONNECT)
             self._client.request_modeldef()
         if frame is None or self._described is None:
@@ -107,20 +112,8 @@ class NatNet:
         client.request_modeldef()
         return client
 
-    def _until(self, done: Any) -> bool:
-        """Read packets until a condition holds; return False after `WAIT_S`."""
-        end_s = time.monotonic() + WAIT_S
-        while not done() and time.monotonic() < end_s:
-            self._read()
-            time.sleep(0.01)
-        return bool(done())
-
     def _read(self) -> None:
-        """Read the packets that have come.
-
-        Raises:
-            OSError: a packet cannot be read, or the network is gone.
-        """
+        """Read the packets that have come."""
         try:
             with contextlib.redirect_stdout(io.StringIO()):  # the package prints each odd packet
                 self._client.update_sync()
@@ -152,16 +145,4 @@ class NatNet:
             if one.model_name == self._name.markers and len(one.marker_pos_list) == self._n_markers:
                 marker_m = np.array(one.marker_pos_list).reshape(-1, 3)
         marker_m[(marker_m == 0.0).all(axis=1)] = np.nan  # a hidden marker stands at the origin
-        return CaptureFrame(frame.suffix.timestamp, self._latency(frame.suffix), bodies, marker_m)
-
-    def _latency(self, end: Any) -> float:
-        """Return the time [s] from exposure to sending; NaN where the clock's rate is not known yet.
-
-        The package does not read the rate of the server's clock, so it is taken from two frames' times.
-        """
-        self._first = self._first or end
-        seconds = end.timestamp - self._first.timestamp
-        if end.stamp_transmit is None or seconds <= 0.1:
-            return math.nan
-        per_s = (end.stamp_transmit - self._first.stamp_transmit) / seconds
-        return (end.stamp_transmit - end.stamp_camera_mid_exposure) / per_s if per_s > 0.0 else math.nan
+        return CaptureFrame(frame.suffix.timestamp, bodies, marker_m)

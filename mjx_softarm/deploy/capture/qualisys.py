@@ -1,7 +1,6 @@
 """Frames of Qualisys Track Manager over its real-time protocol, by the package `qtm-rt`.
 
-Positions come in millimetres, axes as a matrix column by column. Unseen bodies and markers are NaN. QTM does
-not report how old a frame is when it is sent.
+Positions come in millimetres, axes as a matrix column by column. Unseen bodies and markers are NaN.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import asyncio
 import contextlib
 import importlib
 import logging
-import math
 import socket
 import xml.etree.ElementTree
 from functools import partial
@@ -28,7 +26,7 @@ AGAIN_S = 2.0  # time between two tries to reach a server that has gone
 
 
 class Qualisys:
-    """Connection to QTM; see `Source`. Its event loop runs only within `poll`, so there is no thread.
+    """Connection to QTM. Its event loop runs only within `poll`, so there is no thread.
 
     Raises:
         InputError: the package is missing, or QTM has no such body or no such markers.
@@ -53,7 +51,11 @@ class Qualisys:
             raise
 
     def poll(self) -> CaptureFrame | None:
-        """Return the newest frame since the last call, None without one, at once; see `Source`."""
+        """Return the newest frame since the last call, None without one, at once.
+
+        Raises:
+            OSError: QTM cannot be reached.
+        """
         # Let the event loop take the packets that have come, and try to connect again after a loss.
         if not self._connected() and (self._task is None or self._task.done()):
             self._task = self._loop.create_task(self._again())
@@ -116,13 +118,9 @@ class Qualisys:
             unless_done.pop_all()
 
     async def _ask(self, connection: Any) -> None:
-        """Find the bodies and markers by name, and ask for frames.
-
-        Raises:
-            InputError: QTM has no such body or no such markers.
-        """
+        """Find the bodies and markers by name, and ask for frames."""
         name = self._name
-        where = f"--capture qualisys:{self._name.host}"
+        where = f"--capture qualisys:{name.host}"
         settings = await connection.get_parameters(["6d", "3d"])
 
         # Places of bodies and markers in frames, by the order of QTM's settings
@@ -152,4 +150,4 @@ class Qualisys:
         marker_m = np.full((len(self._markers), 3), np.nan)
         if self._markers and (markers := packet.get_3d_markers()):
             marker_m = 1e-3 * np.array(markers[1], float)[self._markers]
-        return CaptureFrame(1e-6 * packet.timestamp, math.nan, bodies, marker_m)
+        return CaptureFrame(1e-6 * packet.timestamp, bodies, marker_m)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,35 +20,16 @@ class CaptureFrame(NamedTuple):
 
     Attributes:
         time_s: time [s] on the system's clock.
-        latency_s: time [s] from the cameras' exposure to sending; NaN where the system does not report it.
         bodies: origin (3,) [m] and axes (3, 3), as columns, of each rigid body that is seen.
         marker_m (n_markers, 3) [m]: NaN for a marker that is not seen.
     """
 
     time_s: float
-    latency_s: float
     bodies: Mapping[str, tuple[np.ndarray, np.ndarray]]
     marker_m: np.ndarray
 
 
-class Source(Protocol):
-    """A connection to a motion capture system."""
-
-    def poll(self) -> CaptureFrame | None:
-        """Return the newest frame since the last call, None without one, at once.
-
-        Raises:
-            OSError: the system cannot be reached, or its packets cannot be read.
-        """
-        ...
-
-    def close(self) -> None:
-        """End the connection."""
-        ...
-
-
-@dataclass(frozen=True)
-class CaptureName:
+class CaptureName(NamedTuple):
     """Settings that the option `--capture` names."""
 
     system: str
@@ -61,11 +41,7 @@ class CaptureName:
 
     @classmethod
     def read(cls, text: str) -> CaptureName:
-        """Read the option's text.
-
-        Raises:
-            InputError: it is malformed.
-        """
+        """Read the option's text; InputError if it is malformed."""
         words, *options = text.split(",")
         system, host, body, *_ = *words.split(":", 2), "", ""
         named = {key: value for key, _, value in (option.partition("=") for option in options)}
@@ -80,11 +56,7 @@ class CaptureName:
 
 
 def check_names(where: str, kind: str, asked: str, known: list[str]) -> None:
-    """Refuse a body or a marker set that the system does not have.
-
-    Raises:
-        InputError: it has none of this name.
-    """
+    """Refuse a body or a marker set, by an InputError, that the system does not have."""
     if asked and asked not in known:
         raise InputError(f"{where}: got no {kind} {asked!r}, expected one of {', '.join(known) or 'some'}")
 

@@ -56,14 +56,12 @@ class LdcSprings:
                 raise ValueError(f"channels: got {place}, expected bus, address and channel of each spring")
         self._springs: dict[tuple[int, int], dict[int, int]] = {}
         for spring, (bus, address, channel) in enumerate(channels):
-            self._springs.setdefault((bus, address), {})[channel] = spring
-        n_known = sum(map(len, self._springs.values()))
-        if n_known != len(channels) or not all(
-            {*springs} <= {0, 1, 2, 3} for springs in self._springs.values()
-        ):
-            raise ValueError(
-                f"channels: got {channels}, expected a channel 0 to 3 of its own for each spring"
-            )
+            others = self._springs.setdefault((bus, address), {})
+            if channel in others or channel not in range(4):
+                raise ValueError(
+                    f"channels: got {channels}, expected a channel 0 to 3 of its own for each spring"
+                )
+            others[channel] = spring
         if not 0 <= drive_current <= 31:
             raise ValueError(f"drive_current: got {drive_current}, expected 0 to 31")
         self._n = len(channels)

@@ -68,11 +68,8 @@ def open_arm(name: str) -> Any:
         sys.path.insert(0, folder)
     try:
         kind = getattr(importlib.import_module(module_name), item)
-    except ImportError as error:
-        raise InputError(f"--arm {name}: got {error}, expected twin:SEED or a module of yours") from error
-    except AttributeError as error:
-        got = f"no {item!r} in {module_name}"
-        raise InputError(f"--arm {name}: got {got}, expected an arm's class") from error
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"--arm {name}: got {error}, expected twin:SEED or a class of yours") from error
     if missing := [method for method in _METHODS if not callable(getattr(kind, method, None))]:
         got = f"no method {' or '.join(missing)}"
         raise InputError(f"--arm {name}: got {got}, expected those of deploy.ArmIO")
@@ -84,12 +81,7 @@ def open_arm(name: str) -> Any:
 
 
 def _wired(path: Path) -> SerialArm:
-    """Open the arm that a file describes.
-
-    Raises:
-        InputError: the file cannot be read, names another table, driver or setting, or the arm cannot be
-            reached.
-    """
+    """Open the arm that a file describes."""
     where = f"--arm {path}"
     try:
         tables = tomllib.loads(path.read_text("utf-8"))
@@ -101,8 +93,8 @@ def _wired(path: Path) -> SerialArm:
         raise InputError(f'{where}: got {tables}, expected the table arm with driver = "serial"')
     # Settings are the class attributes that a class of one's own would have.
     settings = {key: value for key, value in table.items() if key != "driver"}
-    known = list(SerialArm.__annotations__)
-    if unknown := settings.keys() - {*known}:
+    known = SerialArm.__annotations__
+    if unknown := settings.keys() - known:
         raise InputError(f"{where}: got {', '.join(sorted(unknown))}, expected some of {', '.join(known)}")
     try:
         return type("Arm", (SerialArm,), settings)()
@@ -135,13 +127,10 @@ class Paced:
 
 
 def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
-    """Refuse an arm whose number of springs is not the specification's, before any pressure.
-
-    Returns:
-        Its readings (n_springs,). None where it could not be read: the run then says why.
+    """Return an arm's readings (n_springs,), None where it could not be read: the run then says why.
 
     Raises:
-        InputError: the number is another; the message begins with `name`.
+        InputError: their number is not the specification's; the message begins with `name`.
     """
     try:
         readings = np.array(arm.read_sensors(), float)
@@ -163,7 +152,7 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
     """
     # Readings; a run, too, waits LOST_TICKS ticks for them
     policy = controller.policy
-    spec = controller.policy.spec
+    spec = policy.spec
     length_m = np.full(spec.n_springs, np.nan)
     for _ in range(LOST_TICKS):
         readings = check_number(arm, spec, name)

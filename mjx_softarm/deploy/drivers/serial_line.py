@@ -121,10 +121,10 @@ class SerialArm:
 
         # Its answer; answers to earlier requests are skipped.
         while (left_s := end_s - time.monotonic()) > 0.0:
-            line = self.receive(left_s).decode("ascii", "replace")
-            head, count, *words = line.split() if line.endswith("\n") and len(line.split()) > 1 else ("", "")
-            if count != str(self._count):
+            words = self.receive(left_s).decode("ascii", "replace").split()
+            if words[1:2] != [str(self._count)]:
                 continue
+            head, _, *words = words
             text = " ".join(words)
             if head == "E":
                 raise ValueError(f"{letter}: got the refusal {text!r}, expected an answer")

@@ -20,12 +20,12 @@ def serve(monkeypatch, request):
     """Return what starts a server of a system, on a port of its own."""
 
     def make(system, scene, **options):
-        module = pytest.importorskip(
-            {"natnet": "natnet", "qualisys": "qtm_rt"}[system], reason="pip install -e '.[capture]'"
-        )
-        assert module
-        server = (NatNetServer if system == "natnet" else QualisysServer)(scene, **options)
-        port = "natnet.COMMAND_PORT" if system == "natnet" else "qualisys.PORT"
+        package, kind, port = {
+            "natnet": ("natnet", NatNetServer, "natnet.COMMAND_PORT"),
+            "qualisys": ("qtm_rt", QualisysServer, "qualisys.PORT"),
+        }[system]
+        pytest.importorskip(package, reason="pip install -e '.[capture]'")
+        server = kind(scene, **options)
         monkeypatch.setattr(f"mjx_softarm.deploy.capture.{port}", server.port)
         request.addfinalizer(lambda: server.__exit__())
         return server.__enter__()

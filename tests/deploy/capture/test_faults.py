@@ -31,9 +31,7 @@ def test_a_lost_body_is_a_gap_that_is_told(system, serve, opened, monkeypatch):
     look(arm)
     assert re.fullmatch("motion capture: lost: got .*", lines[0])
     assert re.fullmatch(r"motion capture: back after \d+\.\d s", lines[1]) and len(lines) == 2
-    text = arm.finish()
-    assert re.search(r"the tip was seen in \d+ of \d+ ticks; .*at most \d+ ms later", text)
-    assert ("sent 4.0 ms after the exposure" in text) == (system == "natnet")
+    assert re.search(r"the tip was seen in \d+ of \d+ ticks; at most \d+ ms later", arm.finish())
 
 
 @pytest.mark.parametrize("system", SYSTEMS)

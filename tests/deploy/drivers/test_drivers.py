@@ -42,19 +42,18 @@ class Controller:
         return [late, f"P {count}\n".encode()]
 
 
-def serve(controller):
-    """Return the driver's class and what ends the other end."""
+@pytest.fixture
+def driven():
+    """The driver's class, and the microcontroller at the other end of its line."""
+    pytest.importorskip("serial")
+    controller = Controller()
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
 
     def loop():
         pending = b""
         while True:
-            try:
-                pending += os.read(ours, 4096)
-            except OSError:
-                return
-            *lines, pending = pending.split(b"\n")
+            *lines, pending = (pending + os.read(ours, 4096)).split(b"\n")
             for line in lines:
                 if line == b"end":
                     return
@@ -62,27 +61,13 @@ def serve(controller):
                     os.write(ours, answer[: len(answer) // 2])  # in two parts, as they come over a wire
                     os.write(ours, answer[len(answer) // 2 :])
 
-    name = os.ttyname(theirs)
     thread = threading.Thread(target=loop)
     thread.start()
-
-    def end():
-        os.write(theirs, b"end\n")
-        thread.join()
-        os.close(ours)
-        os.close(theirs)
-
-    return type("Arm", (SerialArm,), {"port": name, "n": N, "timeout_s": TIMEOUT_S}), end
-
-
-@pytest.fixture
-def driven(request):
-    """The driver's class, and the microcontroller at the other end of its line."""
-    pytest.importorskip("serial")
-    controller = Controller()
-    kind, end = serve(controller)
-    request.addfinalizer(end)
-    return kind, controller
+    yield type("Arm", (SerialArm,), {"port": os.ttyname(theirs), "n": N, "timeout_s": TIMEOUT_S}), controller
+    os.write(theirs, b"end\n")
+    thread.join()
+    os.close(ours)
+    os.close(theirs)
 
 
 @pytest.fixture
