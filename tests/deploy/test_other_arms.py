@@ -10,6 +10,7 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import follow
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.twin.arm import Twin
 from tests.arms import FOUR_CHAMBERS
 from tests.linear_arm import Leaking, LinearArm, gain_of, make_policy
 
@@ -86,3 +87,17 @@ def test_spring_is_stuck_if_the_chamber_beside_it_is_driven():
         assert np.flatnonzero(stuck_springs(spring_m, pressure_kpa, 3)).tolist() == expected
     spring_m[:, 5] += np.linspace(0.0, 3e-3, 25)  # a spring of the same section
     assert np.flatnonzero(stuck_springs(spring_m, np.zeros((25, 18)), 3)).tolist() == [4]
+
+
+def test_twin_is_led_to_a_goal(other_arm):
+    """Springs that a twin has at some pressures, redundant ones among them, come back under the law."""
+    kpa = np.random.default_rng(0).uniform(-20.0, 0.0, other_arm.n_chambers)
+    pressed, twin = Twin(1, other_arm, 0.0), Twin(1, other_arm, 0.0)
+    for tick in range(150):
+        pressed.write_pressures(kpa * min(1.0, tick / 50))
+    spring_m = other_arm.spring_sensor.lengths(pressed.read_sensors()).length_m
+    controller = controller_of(other_arm, spring_m)
+    check_arm(twin, controller, "twin")
+    run = follow(twin, controller, [np.asarray(estimate(controller.policy.estimator, spring_m, 0.0), float)])
+    tip_m = run.log.tip_m[run.arrivals[0].row - 25 :].mean(axis=0)
+    assert not run.events and np.linalg.norm(tip_m - pressed.motion_capture().tip_m) < 2e-3
