@@ -246,7 +246,11 @@ def arm_rows():
 def test_minutes_of_recording_are_those_of_the_file():
     made = figures("arms-minutes")["arms"]
     page = " ".join((ROOT / "docs/trust.md").read_text("utf-8").split())
-    for n_poses, minutes in ((60, "Six to ten minutes brought"), (150, "ten to twenty-six")):
+    for n_poses, minutes in (
+        (60, "Six to ten minutes brought"),
+        (150, "ten to twenty-six"),
+        (500, "poses brought"),
+    ):
         rows = [one for one in made if one["poses"] == n_poses]
         low, high = (f"{end(one['circle, mean [mm]'] for one in rows):.2f}" for end in (min, max))
         assert f"{minutes} {low} to {high}" in page

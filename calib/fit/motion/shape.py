@@ -7,8 +7,8 @@ shares its bend. In motion the shares lag by a time constant T, which the dampin
     even(l) + U,    T U' = rest(l) - even(l) - U,
 
 with the tip's place rest(l) at rest with spring lengths l, and even(l) with sections that bend evenly.
-Neither pressures nor the chambers' damping take part. The sim-to-real network corrects rest(l); what is left
-of its errors is taken for linear in l. A row
+Neither pressures nor the chambers' damping take part. The sim-to-real network's correction is added to
+even(l), as in the loop: it does not lag. What it leaves is taken for linear in l. A row
 without a tip has no error, and U goes on there. Rows without lengths cut a log into parts.
 
 The interval of log T follows from the curvature of the cost, from the spread of its slope between blocks of
@@ -117,7 +117,7 @@ def _log_std(cost: np.ndarray) -> float:
     return float(np.sqrt(len(slope) * np.var(slope, ddof=1) / curvature**2 + LOG_STEP**2 / 12.0))
 
 
-# l [m]; tip less even(l) [mm], NaN where the tip was not seen; rest(l) less even(l) [mm]
+# l [m]; tip less even(l) [mm], corrected, NaN where the tip was not seen; rest(l) less even(l) [mm]
 Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -142,12 +142,14 @@ def _parts(log: Log, arm: CalibratedArm, left: int) -> list[Part]:
         if not known[part[0]] or np.count_nonzero(seen) * EVERY_S < MIN_S:
             continue
         length_m, at_rest = spring_m[rows], simulate_poses(spec, spring_m[rows])
-        rest_mm = at_rest.pose if arm.s2r is None else np.asarray(correct(arm.s2r, at_rest.pose, length_m))
         even_mm = even_pose(base, np.asarray(params.spring_site_m), length_m)[:, :3]
+        uneven_mm = at_rest.pose[:, :3] - even_mm
+        if arm.s2r is not None:
+            even_mm = np.asarray(correct(arm.s2r, at_rest.pose, length_m))[:, :3] - uneven_mm
         # A row at which the simulated arm finds no rest has no error, and the rest of the row before it
         tip_mm = np.where((seen & at_rest.valid)[:, None], 1e3 * tip_m[rows], np.nan)
         newest_valid = np.maximum.accumulate(np.where(at_rest.valid, np.arange(len(rows)), 0))
-        parts.append((length_m, tip_mm - even_mm, (rest_mm[:, :3] - even_mm)[newest_valid]))
+        parts.append((length_m, tip_mm - even_mm, uneven_mm[newest_valid]))
         left -= len(rows)
     return parts
 

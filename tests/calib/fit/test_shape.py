@@ -31,6 +31,7 @@ DAMPING = DampingFit(
     warnings=(),
 )
 SPEC = ArmSpec.default().replace(structure={"n_sections": 2, "links_per_section": 2})
+ARM = CalibratedArm(SPEC)
 DT_S = 1.0 / SPEC.control.rate_hz
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, per_section=2)
 
@@ -53,7 +54,7 @@ def long():
 
 
 def test_a_planted_damping_comes_back(quick):
-    own, planted = fit_shape([log_of(1.0)], SPEC), fit_shape([quick], SPEC)
+    own, planted = fit_shape([log_of(1.0)], ARM), fit_shape([quick], ARM)
     assert planted.lag_s == pytest.approx(0.25 * own.lag_s, rel=0.25)
     assert planted.is_better and planted.rms_mm < 0.7 * planted.before_rms_mm
     assert planted.spec.shape_lag_s == pytest.approx(planted.lag_s)
@@ -67,32 +68,32 @@ def test_a_log_without_springs_tip_or_dense_rows_has_no_lag(quick):
     without = [{"tip_m": None}, {"readings": None, "spring_m": None}]
     logs = [dataclasses.replace(quick, **none) for none in without]
     logs.append(quick.take(np.arange(0, len(quick), 25)))
-    assert fit_shape(logs, SPEC) is None
+    assert fit_shape(logs, ARM) is None
     backbone = {"bending_damping_nms_per_rad": 0.0}
-    assert fit_shape([quick], SPEC.replace(backbone=backbone)) is None
+    assert fit_shape([quick], CalibratedArm(SPEC.replace(backbone=backbone))) is None
 
 
 @pytest.mark.parametrize("lost_from_s", [0.0, 4.5])
 def test_tips_that_were_not_seen_do_not_shorten_the_lag(long, lost_from_s):
     """A quarter of the rows has no tip: 1.5 s in every 6 s."""
-    whole = fit_shape([long], SPEC)
+    whole = fit_shape([long], ARM)
     lost = (long.time_s % 6.0 >= lost_from_s) & (long.time_s % 6.0 < lost_from_s + 1.5)
     tip_m = np.where(lost[:, None], np.nan, long.tip_m)
-    found = fit_shape([dataclasses.replace(long, tip_m=tip_m)], SPEC)
+    found = fit_shape([dataclasses.replace(long, tip_m=tip_m)], ARM)
     assert found.lag_s == pytest.approx(whole.lag_s, rel=0.15)
     assert found.log_std < 0.15
 
 
 def test_a_log_is_cut_where_lengths_are_missing(long):
     readings = np.where((long.time_s % 25.0 > 23.5)[:, None], np.nan, long.readings)
-    found = fit_shape([dataclasses.replace(long, readings=readings)], SPEC)
+    found = fit_shape([dataclasses.replace(long, readings=readings)], ARM)
     parts = [long.take(np.flatnonzero(long.time_s // 25.0 == k)[: round(23.5 / DT_S)]) for k in range(4)]
-    assert found.lag_s == pytest.approx(fit_shape(parts, SPEC).lag_s, rel=1e-9)
+    assert found.lag_s == pytest.approx(fit_shape(parts, ARM).lag_s, rel=1e-9)
 
 
 def test_a_lag_beyond_those_tried_is_not_believed(quick, monkeypatch):
     monkeypatch.setattr(shape, "LAGS_S", shape.LAGS_S[shape.LAGS_S > 0.3])
-    found = fit_shape([quick], SPEC)
+    found = fit_shape([quick], ARM)
     assert found.at_end and not found.is_better and found.log_std == np.inf
     assert found.rms_mm < 0.98 * found.before_rms_mm
     section = sections.damping(DAMPING, found)
@@ -100,14 +101,30 @@ def test_a_lag_beyond_those_tried_is_not_believed(quick, monkeypatch):
     assert to_json([section], [], {})["parts"]["Damping"]["figures"]["shape"]["log_std"] is None
 
 
-def test_the_damping_fit_has_the_interval_of_the_lag_as_its_prior(quick, monkeypatch):
-    asked = []
+def test_the_backbones_damping_is_the_shapes_own(quick, monkeypatch):
+    """The fit to the tip in motion leaves it, and reports the interval of the shape's lag."""
+    monkeypatch.setattr(steps, "find_stretches", lambda logs, spec: [None])
+    monkeypatch.setattr(
+        steps, "fit_damping", lambda _, spec, seed, width: fits.append((spec, width)) or DAMPING
+    )
+    fits = []
+    steps.damping(Measurements((quick,), None, {}), ARM, 0)
+    found = fit_shape([quick], ARM)
+    [(spec, width)] = fits
+    assert spec.shape_lag_s == pytest.approx(found.lag_s)
+    assert width == pytest.approx(found.half_width_s / found.lag_s)
 
-    def fit(stretches, spec, seed, prior):
-        asked.append((spec.shape_lag_s, prior))
-        return dataclasses.replace(DAMPING, spec=spec)
 
-    monkeypatch.setattr(steps, "fit_damping", fit)
-    steps.damping(Measurements((quick,), None, {}), CalibratedArm(SPEC), 0)
-    found = fit_shape([quick], SPEC)
-    assert asked == [(pytest.approx(found.lag_s), found.log_std)]
+def test_errors_at_rest_that_the_network_corrects_do_not_change_the_lag(long, monkeypatch):
+    """Tips are up to some 10 mm off, with the square of the lengths, as no line can say."""
+
+    def off_mm(spring_m):
+        return 1e5 * (np.asarray(spring_m) - SPEC.geometry.section_length_m)[:, :3] ** 2
+
+    spring_m = SPEC.spring_sensor.lengths(long.readings, np.nan).length_m
+    log = dataclasses.replace(long, tip_m=long.tip_m + 1e-3 * off_mm(spring_m))
+    monkeypatch.setattr(shape, "correct", lambda _, pose, m: pose + np.pad(off_mm(m), [(0, 0), (0, 3)]))
+    corrected = fit_shape([log], CalibratedArm(SPEC, s2r=object()))
+    before, uncorrected = fit_shape([long], ARM), fit_shape([log], ARM)
+    assert corrected.lag_s == before.lag_s and corrected.rms_mm == pytest.approx(before.rms_mm, rel=1e-3)
+    assert uncorrected.rms_mm > 2.0 * before.rms_mm
