@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from calib.arm import CalibratedArm
-from calib.fit.chambers import MIN_POSES
+from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.motion.actuators import ArmLag, fit_actuators, with_actuators
 from calib.fit.motion.tracks import find_tracks
 from calib.fit.s2r import simulate_poses
@@ -175,13 +175,14 @@ def test_springs_show_regulators_whose_pressures_are_not_measured(short):
 def test_springs_of_an_arm_at_rest_show_its_pressures(spec):
     """The arm is unlike its specification; the poses at rest make up for most of that."""
     arm = planted(spec=spec)
-    resting_kpa = pressures_by_springs(measure([pose_log(arm, 150, 0)], spec), spec, 0)
+    poses = measure([pose_log(arm, 150, 0)], spec).poses.with_lengths(spec)
+    simulated_kpa = simulate_poses(spec, poses.spring_m).pressure_kpa
+    held = fit_held_pressures(spec, poses.spring_m, poses.pressure_kpa, simulated_kpa).held
     others = settle_many(arm, planted_pressures(60, 1))
-    off_kpa = resting_kpa(others.spring_m) - others.pressure_kpa
+    off_kpa = pressures_by_springs(CalibratedArm(spec, held=held), others.spring_m) - others.pressure_kpa
     uncorrected_kpa = simulate_poses(spec, others.spring_m).pressure_kpa - others.pressure_kpa
     rms, before = (np.sqrt(np.mean(x**2)) for x in (off_kpa, uncorrected_kpa))
     assert rms < 0.3 * before and rms < 0.5
-    assert pressures_by_springs(measure([pose_log(arm, MIN_POSES - 1, 0)], spec), spec, 0) is None
 
 
 def test_a_log_without_commands_or_of_poses_alone_says_so(short):
