@@ -1,7 +1,6 @@
 """Programs that take turns, so that whatever else the machine does slows all of them alike.
 
-Each is a process of its own: compilation starts from an empty cache, memory is its own, and it may run in
-another virtual environment. It prepares itself, then does one round of work on each request.
+Each is a process of its own, maybe in another virtual environment. It does a round of work on each request.
 """
 
 from __future__ import annotations
@@ -24,6 +23,11 @@ ROOT = Path(__file__).resolve().parents[2]
 ANSWER_S = 1800.0  # longest silence of a program; compiling takes minutes
 
 Facts = dict[str, Any]
+
+
+def n_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Worker:

@@ -18,7 +18,6 @@ Source: SoRoMoX, https://github.com/tud-phi/soromox.
 from __future__ import annotations
 
 import math
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -26,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.rounds import Facts, serve
+from benchmarks.harness.rounds import Facts, n_cores, serve
 from mjx_softarm.mechanics.body import chamber_directions, holes_m
 from mjx_softarm.spec import ArmSpec
 
@@ -129,8 +128,7 @@ def move(method: str, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare n arms, and check that they stay finite for `CHECKED_S`."""
     import jax
 
-    n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", n_cores)  # XLA runs most of this on one core of a device
+    jax.config.update("jax_num_cpu_devices", n_cores())  # XLA runs most of this on one core of a device
     from jax.sharding import Mesh, PartitionSpec
 
     # A step of one arm, and one of all arms over the time that a set of pressures is held.
