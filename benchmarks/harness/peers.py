@@ -1,9 +1,7 @@
-"""Virtual environments of the libraries that this project is compared with, made on first use.
+"""Virtual environments `.venv-PEER` of the libraries that this project is compared with, made on first use.
 
-Each has the peer, and the simulator's packages in the versions that run here: all contestants train on the
-same environment, and other simulators read the same arm. They lie beside the checkout's own `.venv`,
-as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one of other packages, is
-made anew.
+Each has the peer, and the simulator's packages in the versions that run here. A file in each lists its
+packages: an incomplete environment, or one of other packages, is made anew.
 
 On Linux, PyTorch comes with gigabytes of CUDA. To do without them, set
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.

@@ -1,9 +1,7 @@
 """Hindsight for the peers: the arms in the form they need, and their own hindsight replay on it.
 
-Stable-Baselines3's `HerReplayBuffer` needs observations as a dictionary. It chooses which transitions get a
-goal that was reached later in their episode, and recomputes their reward. Here the observed error and the
-termination are recomputed, too, and as many goals as in ours are near the pose that was reached. The buffer
-cannot exchange actions: a saturated transition costs as much with its new goal as with its own.
+Beside the reward, the observed error and the termination are recomputed, and as many goals as in ours are
+near the pose reached. Actions are not exchanged: a saturated transition costs as much with its new goal.
 """
 
 from __future__ import annotations
