@@ -45,8 +45,7 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
     content = "\n".join([f"python {sys.version_info.major}.{sys.version_info.minor}", *packages]) + "\n"
     if marker.exists() and marker.read_text("utf-8") == content:
         return python
-    large = " and PyTorch" if any(package.startswith("torch=") for package in packages) else ""
-    print(f"making {home} with {packages[0]}{large}; the first time this takes minutes ...", flush=True)
+    print(f"making {home} with {packages[0]}; the first time this takes minutes ...", flush=True)
     marker.unlink(missing_ok=True)
     try:
         venv.create(home, with_pip=True, clear=True)

@@ -33,17 +33,11 @@ def n_cores() -> int:
 class Worker:
     """A program that answers with one line of JSON once it is ready, and with one for each round.
 
-    Args:
-        name: its name in messages.
-        program: module and arguments, as after `python -m`.
-        python: the interpreter; this one if None.
-
-    Raises:
-        InputError: in `start` and `round`, the program stopped or was silent for too long; the message has
-            the last line that it wrote.
+    `start` and `round` raise InputError with its last line if it stopped, or was silent for too long.
     """
 
     def __init__(self, name: str, program: Sequence[str], python: Path | None = None):
+        """Name a program of module and arguments, and its interpreter, by default this one."""
         self.name, self.facts = name, {}
         self.command = [str(python or sys.executable), "-m", *program]
         self._process: Any = None
@@ -100,11 +94,7 @@ class Worker:
 
 
 def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list[Facts]], dict[str, str]]:
-    """Start workers, do rounds, one of each worker in turn, and close them.
-
-    Returns:
-        The rounds of each worker that did them all, and the reason of each that failed, by name.
-    """
+    """Return the rounds of each worker that did them all, and the reason of each that failed, by name."""
     rounds: dict[str, list[Facts]] = {worker.name: [] for worker in workers}
     failed: dict[str, str] = {}
 

@@ -40,19 +40,14 @@ class WorkStage(NamedTuple):
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Make the folder, or check that its results have these settings.
-
-    Raises:
-        InputError: the folder has other settings.
-    """
+    """Make the folder, or raise InputError if its results have other settings."""
     file = folder / "settings.json"
     expected = json.loads(json.dumps(settings))
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
         write_json(file, expected)
     stored = json.loads(file.read_text("utf-8"))
-    names = [name for name in expected if stored.get(name) != expected[name]]
-    if names:
+    if names := [name for name in expected if stored.get(name) != expected[name]]:
         got, asked = (", ".join(f"{name} {made.get(name)}" for name in names) for made in (stored, expected))
         raise InputError(f"{file}: got {got}, expected {asked}; choose another folder")
 

@@ -12,7 +12,7 @@ from benchmarks.__main__ import main
 from benchmarks.harness.rounds import ROOT
 from benchmarks.speed import jax_worker, throughput
 from benchmarks.speed.jax_worker import Program, rates
-from benchmarks.speed.mujoco_arms import REST_M, REST_S, RestDetector, SteppedArms, SteppedEnv
+from benchmarks.speed.mujoco_arms import REST_S, SteppedArms, SteppedEnv
 from benchmarks.speed.truth import error_figures, random_references, reported_error, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
@@ -50,16 +50,6 @@ def test_the_error_of_a_worker_s_answers_is_that_of_their_tips(reference, truth)
     answers = [{"reference_m": reference[k], "tip_mm": off_mm[k]} for k in (slice(0, 2), slice(2, 4))]
     assert reported_error(SPEC, [{"arms": 2}, *answers])["median_mm"] == pytest.approx(2.0, abs=1e-3)
     assert reported_error(SPEC, [{"arms": 2}]) == {}
-
-
-def test_an_arm_rests_when_no_spring_has_moved_for_long_enough():
-    rest, n_quiet = RestDetector(2, SPEC), round(REST_S * SPEC.control.rate_hz)
-    still, ticks = np.zeros(9), []
-    for tick in range(3 * n_quiet):
-        moving = np.where(np.arange(9) == 4, 1.1 * REST_M * min(tick, 10), 0.0)  # the second arm stops later
-        ticks.append(rest.settled(np.stack([still, moving]), np.arange(2)))
-    first = np.argmax(np.array(ticks), axis=0)
-    assert first[0] == n_quiet and first[1] == n_quiet + 10
 
 
 def test_programs_beside_others_have_a_row_each_or_a_reason(monkeypatch):
