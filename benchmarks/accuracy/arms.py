@@ -1,9 +1,6 @@
-"""Arms of several kinds: recorded and calibrated, trained, measured.
+"""Arms of several kinds: recorded, calibrated, trained and measured by the commands of `docs/your-arm.md`.
 
-Each is a rod twin, a twin, or one whose rod is SoRoMoX's. The commands are those of `docs/your-arm.md`. Each
-arm is measured around a circle, and by default at a grid of goals over its workspace. With `--loads` it
-follows the circle with payloads, too, which the loop does not know. With several numbers of poses a picture
-shows the errors over the minutes of recording. The same command goes on where it ended.
+With several numbers of poses a picture shows the errors over the minutes of recording.
 """
 
 from __future__ import annotations
@@ -18,7 +15,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.harness.common import RESULTS, Row, grouped, names_of, target
+from benchmarks.harness.common import RESULTS, Row, grouped, labels_once, names_of, target
 from benchmarks.harness.peers import peer_python
 from benchmarks.harness.stages import EVALUATION_FILE, WorkStage, claim, command, run_stages, train
 from calib.read.logs import read_log
@@ -66,7 +63,7 @@ ARMS = {
 KINDS = tuple(name for name in ARMS if name not in ("twin", "soromox"))  # unless others are asked for
 TITLES = {"twin": "twins", "paper": "rods, of other physics"}
 GOALS = "circle", "grid"
-RECORDING = "poses.npz"
+RECORDING, ACCURACY = "poses.npz", "accuracy.json"
 
 
 class Case(NamedTuple):
@@ -88,13 +85,6 @@ class ArmSettings(NamedTuple):
     steps: int | None
     points: int
     goals: tuple[str, ...]
-    loads: tuple[int, ...]
-
-    @property
-    def measurements(self) -> dict[str, tuple[str, int]]:
-        """Goals and payload [g] of each measurement, by its title."""
-        loaded = {f"circle, {load_g} g": ("circle", load_g) for load_g in self.loads}
-        return {**{goals: (goals, 0) for goals in self.goals}, **loaded}
 
 
 def measure(
@@ -105,7 +95,6 @@ def measure(
     steps: int | None = None,
     points: int = 40,
     goals: Annotated[tuple[str, ...], names_of(GOALS)] = GOALS,
-    loads: cli.Integers = (),
     keep: Path = Path("runs/arms"),
 ) -> dict[str, Any]:
     """How well do arms of several kinds follow goals, from recording to measurement, by the same commands?
@@ -119,22 +108,18 @@ def measure(
         steps: environment steps of each training; None: the preset's
         points: goals of the circle, and of the grid at most
         goals: circle, or circle and grid
-        loads: payloads with which the circle is followed, too [g]
         keep: working folder: the same command continues, and arms, seeds and poses may be added
-
-    Raises:
-        InputError: a command failed, the folder has other settings, or SoRoMoX could not be installed.
     """
     if "circle" not in goals:
         raise InputError(f"--goals: got {','.join(goals)}, expected circle among them")
-    settings, out = ArmSettings(preset, steps, points, goals, loads), keep.absolute()
+    settings, out = ArmSettings(preset, steps, points, goals), keep.absolute()
     claim(out, settings._asdict())
     cases = [Case(*case) for case in itertools.product(arms, seeds, poses)]
-    made = {
-        case: tuple(str(accuracy_file(Path(case.folder), title)) for title in settings.measurements)
+    stages = [
+        WorkStage(case.folder, tuple(f"{case.folder}/{name}/{ACCURACY}" for name in goals), take, (case,))
         for case in cases
-    }
-    run_stages(out, settings, [[WorkStage(case.folder, made[case], take, (case,)) for case in cases]])
+    ]
+    run_stages(out, settings, [stages])
     rows = [figures_of(out, settings, case) for case in cases]
     if len(poses) > 1:
         figure = minutes_figure(rows)
@@ -144,7 +129,6 @@ def measure(
 
 def take(out: Path, settings: ArmSettings, case: Case) -> None:
     """Take an arm through all commands, leaving out those whose results are there."""
-    # The arm, and its stand-in
     kind, folder = ARMS[case.arm], out / case.folder
     file, calibration, run = folder / "arm.toml", folder / "calibration", folder / "run"
     spec = ArmSpec.of(Path(kind.name))
@@ -171,15 +155,9 @@ def take(out: Path, settings: ArmSettings, case: Case) -> None:
 
     # Measure the policy on its arm
     asked = ("mjx_softarm.deploy", "measure", run / "policy.npz", *stand_in, "--points", settings.points)
-    for title, (goals, load_g) in settings.measurements.items():
-        made = accuracy_file(folder, title)
-        options = ("--goals", goals, *(("--payload", load_g) if load_g else ()), "--out", made.parent)
-        ensure(made, *asked, *options, python=python)
-
-
-def accuracy_file(folder: Path, title: str) -> Path:
-    """Return the file of a measurement in the folder of an arm."""
-    return folder / title.replace(", ", "-").replace(" ", "") / "accuracy.json"
+    for goals in settings.goals:
+        options = ("--goals", goals, "--out", folder / goals)
+        ensure(folder / goals / ACCURACY, *asked, *options, python=python)
 
 
 def figures_of(out: Path, settings: ArmSettings, case: Case) -> dict[str, Any]:
@@ -189,11 +167,9 @@ def figures_of(out: Path, settings: ArmSettings, case: Case) -> dict[str, Any]:
     time_s = read_log(folder / RECORDING, spec)[0].time_s
     figures: dict[str, Any] = {"arm": case.arm, "seed": case.seed, "poses": case.poses}
     figures |= {"recording [min]": float(np.ptp(time_s)) / 60, "length [mm]": 1e3 * spec.length_m}
-    for title, (_, load_g) in settings.measurements.items():
-        accuracy = json.loads(accuracy_file(folder, title).read_text("utf-8"))
-        figures |= {f"{title}, {name}": accuracy[key] for name, key in FIGURES.items()}
-        if load_g:
-            figures[f"{title}, estimated [g]"] = accuracy["load_estimate_g"]
+    for goals in settings.goals:
+        accuracy = json.loads((folder / goals / ACCURACY).read_text("utf-8"))
+        figures |= {f"{goals}, {name}": accuracy[key] for name, key in FIGURES.items()}
     return figures
 
 
@@ -209,9 +185,7 @@ def minutes_figure(rows: Sequence[Row]) -> Figure:
         panel.plot(x, y, "o-", color=colours[arm], markersize=4.0, label=TITLES.get(arm, arm))
     panel.set_xlim(left=0.0)
     panel.set_ylim(bottom=0.0)
-    handles, labels = panel.get_legend_handles_labels()
-    legend = dict(zip(labels, handles, strict=True))  # each once
-    panel.legend(legend.values(), legend.keys(), frameon=False)
+    panel.legend(*labels_once(panel), frameon=False)
     return figure
 
 

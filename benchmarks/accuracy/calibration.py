@@ -1,18 +1,16 @@
 """Accuracy of calibration, on a planted arm whose numbers are known and on public logs of real soft arms.
 
-Errors are on contiguous blocks of rows that took no part in the fit. `asl_trunk` is a trunk of three segments
-and six motors (StanfordASL/trunk-stack), `asu_softarm` a pneumatic arm of two sections with draw wires
-(ASU-RISE-Lab/4-chamber-softarm-control). All rows are kept; `fresh` marks those with renewed motion capture.
+Errors are on contiguous blocks of rows that took no part in the fit.
 
 Source: ASU-RISE-Lab/4-chamber-softarm-control (commit 6df7ec9d), StanfordASL/trunk-stack (commit 8b4b9234).
 """
 
 from __future__ import annotations
 
-import functools
 import itertools
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,18 +47,12 @@ def measure(data: cli.MaybePath = None) -> dict[str, Any]:
 
     Args:
         data: folder with `asl_trunk` and `asu_softarm`; None: the planted arm alone
-
-    Raises:
-        OSError: a log cannot be read.
     """
     return {"planted arm": planted_arm(), **(real_logs(data) if data else {})}
 
 
 def planted_arm() -> dict[str, float]:
-    """Return errors of the numbers of `python -m calib demo`, whose geometry differs from the simulator's.
-
-    Tips are in mm.
-    """
+    """Return errors, tips in mm, on `python -m calib demo`, whose geometry differs from the simulator's."""
     spec = ArmSpec.default()
     planted = demo.planted_arm(spec, seed=0)
     with tempfile.TemporaryDirectory() as folder:
@@ -87,9 +79,7 @@ def _worst(fitted: Any, true: Any) -> float:
 def real_logs(data: Path) -> dict[str, Any]:
     """Return errors of calibrated lines, the sim-to-real network and regulators on logs of real arms."""
     splits = {
-        f"a fifth of the blocks, seed {seed}": trunk_errors(
-            data, "1", functools.partial(held_out_blocks, seed=seed)
-        )
+        f"a fifth of the blocks, seed {seed}": trunk_errors(data, "1", partial(held_out_blocks, seed=seed))
         for seed in SEEDS
     }
     splits["another day"] = trunk_across(data, "1", "11")
@@ -103,8 +93,7 @@ def real_logs(data: Path) -> dict[str, Any]:
 def regulators_errors(data: Path) -> dict[str, float]:
     """Return errors [psi] of pressures by the commands of one day, by regulators fitted to the other day.
 
-    The chambers' volumes are not known and taken as constant. A prediction begins with the first measured
-    pressures and then sees the commands alone. Beside them stand the errors of the commands themselves.
+    Volumes are taken as constant; a prediction sees the first measured pressures, then commands alone.
     """
     tracks = {name: asu_track(data / path) for name, path in ASU_LOGS.items()}
     days = {name: Runs([track], ASU_PERIOD_S) for name, track in tracks.items()}
@@ -114,9 +103,8 @@ def regulators_errors(data: Path) -> dict[str, float]:
         regulator, lag_s, _ = fit_regulator(days[fitted], every, MEASURED, n_sections=2)
         error = days[asked].errors(days[asked].simulated([regulator]), lag_s)
         found[f"of {asked}, fitted to {fitted}"] = rms_of(error) / PSI
-        found[f"of {asked}, the commands"] = (
-            rms_of(tracks[asked].commanded_kpa - tracks[asked].pressure_kpa) / PSI
-        )
+        off_kpa = tracks[asked].commanded_kpa - tracks[asked].pressure_kpa
+        found[f"of {asked}, the commands"] = rms_of(off_kpa) / PSI
     return found
 
 
@@ -137,10 +125,9 @@ def wires_error(data: Path, name: str) -> float:
 
 
 def still_rows(time_s: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Mask (n,) of the rows around which x (n,) [m] moves by less than `STILL_M` within `STILL_S`.
+    """Return the rows (n,) around which x (n,) [m] moves by less than `STILL_M` within `STILL_S`.
 
-    Two instruments that are not triggered together differ by speed times delay while the arm moves. A fit's
-    residuals have no say in it.
+    Two instruments that are not triggered together differ by speed times delay while the arm moves.
     """
     before, after = (np.interp(time_s + shift, time_s, x) for shift in (-STILL_S, STILL_S))
     return (np.abs(x - before) < STILL_M) & (np.abs(after - x) < STILL_M)
@@ -153,9 +140,9 @@ def trunk_errors(data: Path, log: str, held_out: Callable[[int], np.ndarray]) ->
     return _trunk_errors(x, tip_mm, ~out & fresh, out & fresh)
 
 
-def trunk_across(data: Path, log: str, asked: str) -> dict[str, float]:
+def trunk_across(data: Path, fitted: str, asked: str) -> dict[str, float]:
     """Return tip errors on the fresh rows of a log, of fits to another log."""
-    parts = [_trunk(data, name) for name in (log, asked)]
+    parts = [_trunk(data, name) for name in (fitted, asked)]
     x, tip_mm, fresh = (np.concatenate(column) for column in zip(*parts, strict=True))
     train = np.arange(len(x)) < len(parts[0][0])
     return _trunk_errors(x, tip_mm, train & fresh, ~train & fresh)

@@ -1,8 +1,4 @@
-"""The paper's recipe as printed: circle and pipe, learned and hand-made reward, and one change at a time.
-
-All runs are in the simulation at rest, on the training model. Demonstrations are the scripted expert's
-postures in this simulation. A run whose results exist is not repeated: seeds and cases may be added.
-"""
+"""The paper's recipe as printed, in simulation at rest: circle and pipe, two rewards, single changes."""
 
 from __future__ import annotations
 
@@ -73,39 +69,33 @@ def measure(
         seeds: of training; changes have the first alone
         cases: which; None: all
         env_steps: of each run, with stages in proportion; None: 300,000 on the circle, a million in the pipe
-
-    Raises:
-        InputError: a training failed, or the folder has other settings.
     """
-    # Demonstrate, and train what is not trained yet.
     claim(out, {"env_steps": env_steps})
     runs = {name: seeds[:1] if CASES[name].one_seed else seeds for name in cases}
     tasks = dict.fromkeys(CASES[name].task for name in cases)
-    demonstrated = [WorkStage(f"demonstrate {t}", (demos_file(t),), demonstrate, (t,)) for t in tasks]
+    demonstrated = [WorkStage(f"demonstrate {t}", (_demos_file(t),), demonstrate, (t,)) for t in tasks]
     trained = [
-        WorkStage(f"{name}, seed {n}", (f"{run_name(name, n)}/{EVALUATION_FILE}",), imitate, (name, n))
+        WorkStage(f"{name}, seed {n}", (f"{_run_name(name, n)}/{EVALUATION_FILE}",), imitate, (name, n))
         for name in cases
         for n in runs[name]
     ]
     run_stages(out, env_steps, [demonstrated, trained])
-    metrics = {name: [Run.open(out / run_name(name, n)).metrics() for n in runs[name]] for name in cases}
+    metrics = {name: [Run.open(out / _run_name(name, n)).metrics() for n in runs[name]] for name in cases}
     return {"cases": final_figures(metrics), "curves": curves(metrics)}
 
 
-def demos_file(task: str) -> str:
-    """Return the path of a task's demonstrations in the folder."""
+def _demos_file(task: str) -> str:
     return f"demos/{task}.npz"
 
 
-def run_name(case: str, seed: int) -> str:
-    """Return the name of a run's folder."""
+def _run_name(case: str, seed: int) -> str:
     return f"{case}-seed{seed}"
 
 
 def demonstrate(folder: Path, _: int | None, task: str) -> None:
     """Write the demonstrations of a task, the expert's postures as the training model has them."""
     xla.enable_compilation_cache()
-    file, spec = folder / demos_file(task), ArmSpec.default()
+    file, spec = folder / _demos_file(task), ArmSpec.default()
     file.parent.mkdir(exist_ok=True)
     waypoints, pipe = waypoints_of(task, spec)
     plan = Expert(spec, None, pipe).plan(waypoints)
@@ -134,14 +124,14 @@ def imitate(folder: Path, env_steps: int | None, name: str, seed: int) -> None:
     if env_steps:
         options += ["--learner.total-env-steps", env_steps]
     options += [f"--{text.removesuffix('=true')}" for text in case.settings]  # a flag has no value
-    train(folder / run_name(name, seed), "imitate", folder / demos_file(case.task), *options)
+    train(folder / _run_name(name, seed), "imitate", folder / _demos_file(case.task), *options)
 
 
 Metrics = Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]  # rows of each seed of each case
 
 
 def final_figures(metrics: Metrics) -> list[dict[str, Any]]:
-    """Return the final figures of each case: the spread over its seeds."""
+    """Return the spread of the last figures of each case over its seeds."""
     last = [
         {"case": name, **{key.removeprefix("evaluation/"): x for key, x in rows[-1].items()}}
         for name, runs in metrics.items()

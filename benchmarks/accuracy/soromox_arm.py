@@ -1,10 +1,8 @@
 """An arm whose rod is a robot of SoRoMoX: the driver `Arm`.
 
-Kinematics, inertia, gravity and the backbone's elasticity are SoRoMoX's, of piecewise constant strains:
-torsion, bending, stretch and shear. Chambers and springs are fibres along it, with the energies of
-`mjx_softarm.twin.rod`; gripper and payload are masses below its end. The time step is linearly implicit
-Euler, one a control period, with the damping of that rod. Readings, regulators and the drawn parts are those
-of `twin:rod:0`. It runs in SoRoMoX's own environment, see `benchmarks.harness.peers`.
+Kinematics, inertia, gravity and the backbone's elasticity are SoRoMoX's, of piecewise constant strains.
+Chambers and springs are fibres along it, with the energies of `mjx_softarm.twin.rod`; gripper and payload are
+masses below its end. All else is of `twin:rod:0`. It runs in SoRoMoX's own environment.
 
     PYTHON -m mjx_softarm.deploy measure POLICY --arm benchmarks.accuracy.soromox_arm:Arm --out FOLDER
     PYTHON -m benchmarks.accuracy.soromox_arm SEED N    tips beside those of a rod twin, at N random pressures
@@ -137,11 +135,7 @@ class SoromoxRod:
         return float(left)
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
-        """Move to rest at pressures (s c,) [kPa].
-
-        Raises:
-            FloatingPointError: the rod does not come to rest.
-        """
+        """Move to rest at pressures (s c,) [kPa]; FloatingPointError if the rod does not come to rest."""
         left = np.inf
         for k in range(SETTLE_STEPS):
             self._v = np.zeros_like(self._v)
@@ -155,8 +149,6 @@ class SoromoxRod:
 
 def fibre_energy(stretch: Array, pressure_kpa: Array, parts: RodParts) -> Array:
     """Return the energy (s, per_section, c + k) [J] of fibres in segments, each as if it were a section.
-
-    Its derivatives by the lengths are the pulls of `mjx_softarm.twin.rod`.
 
     Args:
         stretch (s, per_section, c + k): lengths, divided by that of the segment.

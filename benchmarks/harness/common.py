@@ -1,11 +1,10 @@
-"""Shared parts of the benchmarks: the machine, targets, spreads over runs, tables, and where results go.
+"""The machine, targets, spreads over runs, tables, and where results go.
 
-Figures are nested dictionaries of plain values, made for JSON. `show` prints any of them.
+Figures are nested dictionaries of plain values, made for JSON; `show` prints any of them.
 """
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 import sys
@@ -20,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.constructors import PrimitiveConstructorSpec
 
+from benchmarks.harness.rounds import n_cores
 from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import provenance, write_json
 
@@ -28,11 +28,6 @@ WIDTH = 160  # of tables, where they are not printed to a terminal
 VERDICT = {True: "met", False: "NOT MET", None: "skipped"}
 
 Row = Mapping[str, Any]
-
-
-def n_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def cpu_kind() -> str:
@@ -94,6 +89,13 @@ def spread(values: Sequence[float]) -> str:
     x = np.asarray(values, float)
     mean, off, low, high = x.mean(), x.std(), x.min(), x.max()
     return f"{mean:.4g}" if low == high else f"{mean:.4g} ± {off:.2g} ({low:.4g} to {high:.4g})"
+
+
+def labels_once(panel: Any) -> tuple[list[Any], list[str]]:
+    """Return handles and labels of a picture's legend, each label once."""
+    handles, labels = panel.get_legend_handles_labels()
+    legend = dict(zip(labels, handles, strict=True))
+    return list(legend.values()), list(legend)
 
 
 def show(figures: Row, title: str = "", console: Console | None = None) -> None:

@@ -1,9 +1,7 @@
-"""Virtual environments of the libraries that this project is compared with, made on first use.
+"""Virtual environments `.venv-PEER` of the libraries that this project is compared with, made on first use.
 
-Each has the peer, and the simulator's packages in the versions that run here: all contestants train on the
-same environment, and other simulators read the same arm. They lie beside the checkout's own `.venv`,
-as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one of other packages, is
-made anew.
+Each has the peer, and the simulator's packages in the versions that run here. A file in each lists its
+packages: an incomplete environment, or one of other packages, is made anew.
 
 On Linux, PyTorch comes with gigabytes of CUDA. To do without them, set
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
@@ -47,8 +45,7 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
     content = "\n".join([f"python {sys.version_info.major}.{sys.version_info.minor}", *packages]) + "\n"
     if marker.exists() and marker.read_text("utf-8") == content:
         return python
-    large = " and PyTorch" if any(package.startswith("torch=") for package in packages) else ""
-    print(f"making {home} with {packages[0]}{large}; the first time this takes minutes ...", flush=True)
+    print(f"making {home} with {packages[0]}; the first time this takes minutes ...", flush=True)
     marker.unlink(missing_ok=True)
     try:
         venv.create(home, with_pip=True, clear=True)

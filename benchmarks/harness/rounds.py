@@ -1,7 +1,6 @@
 """Programs that take turns, so that whatever else the machine does slows all of them alike.
 
-Each is a process of its own: compilation starts from an empty cache, memory is its own, and it may run in
-another virtual environment. It prepares itself, then does one round of work on each request.
+Each is a process of its own, maybe in another virtual environment. It does a round of work on each request.
 """
 
 from __future__ import annotations
@@ -26,20 +25,19 @@ ANSWER_S = 1800.0  # longest silence of a program; compiling takes minutes
 Facts = dict[str, Any]
 
 
+def n_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Worker:
     """A program that answers with one line of JSON once it is ready, and with one for each round.
 
-    Args:
-        name: its name in messages.
-        program: module and arguments, as after `python -m`.
-        python: the interpreter; this one if None.
-
-    Raises:
-        InputError: in `start` and `round`, the program stopped or was silent for too long; the message has
-            the last line that it wrote.
+    `start` and `round` raise InputError with its last line if it stopped, or was silent for too long.
     """
 
     def __init__(self, name: str, program: Sequence[str], python: Path | None = None):
+        """Name a program of module and arguments, and its interpreter, by default this one."""
         self.name, self.facts = name, {}
         self.command = [str(python or sys.executable), "-m", *program]
         self._process: Any = None
@@ -96,11 +94,7 @@ class Worker:
 
 
 def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list[Facts]], dict[str, str]]:
-    """Start workers, do rounds, one of each worker in turn, and close them.
-
-    Returns:
-        The rounds of each worker that did them all, and the reason of each that failed, by name.
-    """
+    """Return the rounds of each worker that did them all, and the reason of each that failed, by name."""
     rounds: dict[str, list[Facts]] = {worker.name: [] for worker in workers}
     failed: dict[str, str] = {}
 

@@ -1,8 +1,6 @@
 """Stages whose results stay in a folder, so that the same command continues an interrupted benchmark.
 
-A benchmark is a list of groups of stages. The stages of a group run in processes of their own, two at a time;
-the next group begins once all of them are done. A stage whose results exist is skipped. Results are written
-whole or not at all, so a stage that was killed is simply not done.
+Results are written whole or not at all, so a stage that was killed is simply not done.
 """
 
 from __future__ import annotations
@@ -42,25 +40,20 @@ class WorkStage(NamedTuple):
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Make the folder, or check that its results have these settings.
-
-    Raises:
-        InputError: the folder has other settings.
-    """
+    """Make the folder, or raise InputError if its results have other settings."""
     file = folder / "settings.json"
     expected = json.loads(json.dumps(settings))
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
         write_json(file, expected)
     stored = json.loads(file.read_text("utf-8"))
-    names = [name for name in expected if stored.get(name) != expected[name]]
-    if names:
+    if names := [name for name in expected if stored.get(name) != expected[name]]:
         got, asked = (", ".join(f"{name} {made.get(name)}" for name in names) for made in (stored, expected))
         raise InputError(f"{file}: got {got}, expected {asked}; choose another folder")
 
 
 def run_stages(folder: Path, settings: Any, groups: Sequence[Sequence[WorkStage]]) -> None:
-    """Run the stages that are not done, group by group.
+    """Run the stages that are not done, group by group; those of a group in two processes.
 
     Raises:
         InputError: a stage failed, or left no results; those under way are finished, the others not begun.
@@ -104,16 +97,10 @@ def _end_with_parent() -> None:
 
 
 def command(log: Path, *words: Any, makes: Path, python: Path | str = sys.executable) -> None:
-    """Run a command of this project and append its output to a file.
-
-    Args:
-        log: file for the output.
-        words: of the command line, after `python -m`.
-        makes: file that the command writes. A command that ends with an exception has status 1, too.
-        python: interpreter, whose environment may have other packages.
+    """Run `python -m` with some words, and append the output to a file.
 
     Raises:
-        InputError: it failed, or wrote no such file; the message has the last lines of its output.
+        InputError: it failed, or did not write the file `makes`; an exception's status is 1, too.
     """
     arguments = [str(python), "-m", *map(str, words)]
     with log.open("a", encoding="utf-8") as file:

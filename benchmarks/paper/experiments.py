@@ -87,10 +87,8 @@ def paper(
 ) -> int:
     """How close does the paper's method come on simulated stand-ins for an arm? Takes hours.
 
-    The exit status is 1 if a target is missed.
-
-    Results stay in the working folder: the same command continues, and twins, seeds, loads and presets may be
-    added.
+    The exit status is 1 if a target is missed. The same command continues what is in the working folder;
+    twins, seeds, loads and presets may be added.
 
     Args:
         smoke: run everything, but tiny; says nothing about the arm
@@ -101,9 +99,6 @@ def paper(
         arm: twin, or a rod, of other physics, in open space alone
         beside: further presets in open space, beside analytic
         out: working folder; None: runs/paper
-
-    Raises:
-        InputError: the options do not go together.
     """
     if only != "open" and arm == "rod":
         raise InputError(f"--only: got {only}, expected open with --arm rod")
@@ -133,32 +128,23 @@ def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
     """Return the stages of an experiment, group by group."""
     if experiment == "independence":
         measured = itertools.product((*independence.POLICIES, independence.SOLVER), settings.seeds)
-        return [
-            [
-                WorkStage(
-                    f"{name}, seed {seed}",
-                    (independence.result(name, seed),),
-                    independence.measure,
-                    (name, seed),
-                )
-                for name, seed in measured
-            ]
-        ]
+        return [[_measure(name, seed) for name, seed in measured]]
     calibrated = [
         WorkStage(f"calibrate twin {t}", (f"twin{t}/{CALIBRATION}",), calibrate_twin, (t,))
         for t in settings.twins
     ]
-    tried = [
-        WorkStage(
-            f"try {trial.kind}, twin {trial.twin}, seed {trial.seed}, {trial.variant}",
-            (trial.result,),
-            try_out,
-            (trial,),
-        )
-        for trial in trials(experiment, settings)
-    ]
     learned = _open_stages(settings) if experiment == "open" else _confined_stages(settings)
-    return [calibrated, *learned, tried]
+    return [calibrated, *learned, [_try(trial) for trial in trials(experiment, settings)]]
+
+
+def _measure(name: str, seed: int) -> WorkStage:
+    result = independence.result(name, seed)
+    return WorkStage(f"{name}, seed {seed}", (result,), independence.measure, (name, seed))
+
+
+def _try(trial: Trial) -> WorkStage:
+    name = f"try {trial.kind}, twin {trial.twin}, seed {trial.seed}, {trial.variant}"
+    return WorkStage(name, (trial.result,), try_out, (trial,))
 
 
 def _open_stages(settings: Settings) -> list[list[WorkStage]]:
@@ -170,10 +156,7 @@ def _open_stages(settings: Settings) -> list[list[WorkStage]]:
 
 
 def _confined_stages(settings: Settings) -> list[list[WorkStage]]:
-    """Return the stages that demonstrate, train and export the policies of pipes.
-
-    A policy that takes another's reward is trained after it.
-    """
+    """Return the stages of the policies of pipes; one that takes another's reward is trained after it."""
     keys = [(kind, *run) for kind in PIPE_KINDS for run in settings.runs]
     tasks = dict.fromkeys((twin, KINDS[kind].task) for kind, twin, _ in keys)
     return [
@@ -198,11 +181,7 @@ def _export(twin: int | None, keys: Iterable[tuple[str, int | None, int]]) -> Wo
 
 
 def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
-    """Record a twin, and calibrate it by the log's file, as a user would.
-
-    Raises:
-        InputError: the recording ended early.
-    """
+    """Record a twin, and calibrate it by the log's file, as a user would."""
     home, spec = folder / arm_name(twin), ArmSpec.default()
     home.mkdir(parents=True, exist_ok=True)
     arm: Any = STAND_INS[settings.arm](twin, spec, session=S2R_SESSION)
@@ -217,10 +196,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
 
 
 def reach(folder: Path, settings: Settings, kind: str, twin: int | None, seed: int) -> None:
-    """Train a policy without demonstrations.
-
-    It learns the nominal arm, a twin's calibration, or this without its S2R network (the kind "chambers").
-    """
+    """Train on the nominal arm, on a twin's calibration, or on this without its S2R network ("chambers")."""
     calibration = folder / arm_name(twin) / CALIBRATION
     arm = ("--spec", calibration / ARM_FILE) if kind == "chambers" else ("--calibration", calibration)
     changes = _options([*KINDS[kind].settings, *settings.reach])
@@ -231,14 +207,8 @@ def reach(folder: Path, settings: Settings, kind: str, twin: int | None, seed: i
 def imitate(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> None:
     """Train a policy from demonstrations."""
     kind = KINDS[name]
-    options = [
-        "--preset",
-        kind.preset,
-        "--seed",
-        seed,
-        "--calibration",
-        folder / arm_name(twin) / CALIBRATION,
-    ]
+    calibration = folder / arm_name(twin) / CALIBRATION
+    options = ["--preset", kind.preset, "--seed", seed, "--calibration", calibration]
     options += ["--pipe", f"{1e3 * PIPES[kind.task].diameter_m:g}"]
     if kind.reward_of:
         options += ["--reward", folder / run_path(kind.reward_of, twin, seed)]
@@ -302,8 +272,7 @@ def controller_of(folder: Path, trial: Trial) -> Controller:
         return Controller.of(policy, gradient_descent(policy))
     if trial.kind != "without":
         return Controller.of(policy)
-    # With calibrated springs alone, the nominal arm's policy plans lengths, and the loop reads its sensors
-    # as calibrated.
+    # The nominal arm's policy plans lengths; the loop reads its sensors as calibrated.
     nominal = load_policy(folder / run_path("specified", None, trial.seed) / POLICY_FILE)
     runner = PolicyRunner(nominal)
     calibrated_springs = dataclasses.replace(nominal, actions=nominal.actions._replace(sensor=policy.sensor))

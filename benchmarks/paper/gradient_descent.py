@@ -1,12 +1,7 @@
-"""Gradient descent on the springs: the solver that the policy is compared with.
+"""Gradient descent on the springs, by the estimated pose: the solver that the policy is compared with.
 
-From the measured springs, lengths within the policy's range follow the negative gradient of the squared error
-of the estimated pose. A degree weighs as much as a millimetre: with the reward's weights, the search takes
-far longer to turn the tip. The search knows no pressures, so it may ask for shapes that the pump cannot make.
-
-    Controller.of(policy, gradient_descent(policy))
-
-It replaces the actor in the same loop, though a search lasts longer than a tick of a real arm.
+A degree weighs as much as a millimetre: with the reward's weights, the search takes far longer to turn the
+tip. It knows no pressures, so it may ask for shapes that the pump cannot make.
 
 Source: the solver of Meng et al. 2023 as the paper describes it where it states the problem of saturation.
 """
@@ -14,6 +9,7 @@ Source: the solver of Meng et al. 2023 as the paper describes it where it states
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -38,13 +34,8 @@ def gradient_descent(policy: Policy) -> Callable[..., np.ndarray]:
     low_m, high_m = policy.sensor.lengths(np.stack(policy.actions[1:])).length_m  # (n,) each
     pose_of = forward_kinematics(policy)
 
-    def plan(
-        _pose: np.ndarray, goal: np.ndarray, spring_m: np.ndarray, _sensed: np.ndarray | None
-    ) -> np.ndarray:
-        def residual(x: np.ndarray) -> np.ndarray:
-            return pose_error(pose_of(x), goal)
-
-        return descend(residual, spring_m, low_m, high_m)
+    def plan(_pose: Any, goal: np.ndarray, spring_m: np.ndarray, _sensed: Any) -> np.ndarray:
+        return descend(lambda x: pose_error(pose_of(x), goal), spring_m, low_m, high_m)
 
     return plan
 

@@ -1,13 +1,7 @@
 """The paper's claims of load-independence and of no saturation, in simulation, one cause changed at a time.
 
-All policies learn alike, through the gradient of the simulated equilibrium; `POLICIES` says in which settings
-they differ. A policy may command nine pressures in place of nine spring lengths, which the sensor-space law
-holds. The loss's term that pulls references of saturated chambers back may be left out; pressures have no
-references, so they always go without it. Some kinds learn with payloads, and some of these observe them.
-
-Then the arm carries payloads. The policy sees the true pose of the tip after each of four actions, and the
-true payload if it observes it, so no estimate adds an error. Gradient descent on the springs knows no
-pressures. It goes to some of the goals without a payload, with as many searches as a policy has actions.
+All policies learn through the gradient of the equilibrium; `POLICIES` says where they differ. They see the
+true pose, and the true payload if they observe it, so no estimate adds an error.
 """
 
 from __future__ import annotations
@@ -114,7 +108,6 @@ def figures_of(folder: Path, settings: Settings) -> dict[str, Any]:
 
 def policy_rows(settings: Settings, name: str, seed: int) -> list[dict[str, Any]]:
     """Train one policy; return its figures at the goals of both sets with each payload."""
-    # Train.
     kind, spec = POLICIES[name], ArmSpec.default()
     steps = f"learner.total_env_steps={settings.independence_steps}"
     config = override(PRESETS["analytic"], [steps, *kind.settings])
@@ -122,8 +115,12 @@ def policy_rows(settings: Settings, name: str, seed: int) -> list[dict[str, Any]
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     for _ in range(config.learner.n_epochs):
         state, _ = job.epoch(state)
+<<<<<<< HEAD
     policy = jax.device_get(job.learner.policy(state.learner))
     # Follow paths of goals.
+=======
+    policy = jax.device_get(job.policy(state))
+>>>>>>> sub-bench
     loaded = Randomisation(payload_max_kg=LARGEST_KG)
     env_config = EnvConfig(engine="chain", observation=config.env.observation, randomisation=loaded)
     env = kind.env(spec, env_config)
@@ -161,10 +158,9 @@ def figures(off_mm: np.ndarray, n_saturated: np.ndarray) -> dict[str, float]:
 
 
 def descent_rows(settings: Settings, seed: int) -> list[dict[str, Any]]:
-    """Return the figures of gradient descent, which knows of no payload.
+    """Return the figures of gradient descent without a payload, by the estimator of the policy that ships.
 
-    It goes to some goals of both sets, other ones for each seed, from a random pose, by the estimator of the
-    policy that ships.
+    Each seed has other goals of both sets.
     """
     env, solve = ReachEnv(config=EnvConfig(engine="chain")), gradient_descent(load_policy(SHIPPED))
     step, state = xla.jit(env.step), xla.jit(env.reset)(jax.random.PRNGKey(seed))

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks.harness.common import Row, grouped
+from benchmarks.harness.common import Row, grouped, labels_once
 from benchmarks.paper.trial import finger_tips, operate, watch
 from benchmarks.paper.trials import KINDS, Settings, Trial
 from mjx_softarm.control import Gains
@@ -31,10 +31,7 @@ MAX_FRAMES, FRAME_MS, N_COLOURS = 120, 80, 128
 
 
 def circle_figure(rows: Sequence[Row], at_stops: Sequence[Row], settings: Settings) -> Figure:
-    """Draw the circle from above, reference and path of each kind: a panel for each arm, its first seed.
-
-    Points at which a chamber is saturated are ringed. `at_stops` are those of `trial.operate` of each trial.
-    """
+    """Draw the circle from above, a panel for each arm, its first seed; saturated points are ringed."""
     n_twins = len(settings.twins)
     figure = Figure(figsize=(4.0 * n_twins + 0.6, 5.8 if n_twins == 1 else 5.1), layout="constrained")
     panels = figure.subplots(1, n_twins, squeeze=False, sharex=True, sharey=True)[0]
@@ -53,11 +50,8 @@ def circle_figure(rows: Sequence[Row], at_stops: Sequence[Row], settings: Settin
             panel.plot(*_closed(goal), "--", color=INK, linewidth=1.2, label="reference")
             panel.plot(*_closed(tip), "o-", color=colour, label=KINDS[row["kind"]].title, **style)
             panel.plot(hit[:, 0], hit[:, 1], "o", label="a chamber saturated", **ring)
-    handles, labels = panels[0].get_legend_handles_labels()
-    legend = dict(zip(labels, handles, strict=True))  # each once
-    columns = 2 if n_twins == 1 else 5
-    place = {"loc": "outside lower center", "ncols": columns, "frameon": False}
-    figure.legend(legend.values(), legend.keys(), **place)
+    place = {"loc": "outside lower center", "ncols": 2 if n_twins == 1 else 5, "frameon": False}
+    figure.legend(*labels_once(panels[0]), **place)
     return figure
 
 
@@ -67,10 +61,7 @@ def _closed(points: np.ndarray) -> np.ndarray:
 
 
 def loads_figure(rows: Sequence[Row], arm: str) -> Figure:
-    """Draw the mean error on the circle over the payload, a line for each policy that carries payloads.
-
-    Dots are single runs, bars end at the largest error of a policy's runs.
-    """
+    """Draw errors over the payload: dots of runs, a line of means, bars to the largest error."""
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     panel = figure.subplots()
     dress(panel, f"circle, {arm}s", "payload [g]", "tip error [mm]")
@@ -126,11 +117,7 @@ def traces_figure(logs: Mapping[int, Log], spec: ArmSpec) -> Figure:
 
 
 def film(path: Path, scene: tuple[Any, Controller, np.ndarray, list[str]], trial: Trial) -> None:
-    """Run a trial and write its film: the twin at equal times beside its path.
-
-    The path is that of the tip from above, or in a pipe that of the finger tips from the front.
-    """
-    # Run the trial.
+    """Write a trial's film: the twin beside its tip from above, or its finger tips from a pipe's front."""
     twin, controller, goals, _ = scene
     pipe = PIPES.get(KINDS[trial.kind].task)
     gripper_m = controller.policy.spec.mass.gripper_length_m if pipe else 0.0

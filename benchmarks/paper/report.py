@@ -1,7 +1,6 @@
 """Report of an experiment: figures of each trial, spreads over runs, targets and pictures.
 
-Targets were set before anything was measured. A trial that missed a goal meets none of errors and times,
-however small its error.
+Targets were set before anything was measured. A trial that missed a goal meets none of errors and times.
 """
 
 from __future__ import annotations

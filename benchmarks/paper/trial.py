@@ -1,9 +1,7 @@
 """A trial on a twin and its figures: errors by motion capture, saturation, contact forces, objects moved.
 
-An object is taken if the finger tips are near it when the loop reports an arrival: the twin then gets its
-weight. The padded floor of a container carries more of it the lower the object is, and all where the object
-is picked or placed. An object that is released near its container lies where the finger tips were; elsewhere
-it is lost.
+A held object hangs at the twin, less what a container's padded floor carries: all of it where the object is
+picked or placed. One that is released far from a container is lost.
 """
 
 from __future__ import annotations
@@ -106,10 +104,7 @@ def operate(
     """Follow goals (p, 6) [mm, deg], picking and placing as their names say; return figures and log.
 
     On a lap in time only the first and the last goal are stops; in motion, all but those named "to ...". The
-    figures are of the stops alone. `at_stops` has goals, errors and saturation at each.
-
-    Raises:
-        InputError: no tick was logged.
+    figures are of the stops alone.
     """
     # Watch the twin's contact forces and its gripper.
     gripper_m = controller.policy.spec.mass.gripper_length_m

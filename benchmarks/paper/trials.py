@@ -86,7 +86,6 @@ KINDS = {
     "gradient": Kind("gradient descent"),
     "payload": Kind("with S2R, payload", "payload"),
     "quick": Kind("with S2R, quick", "quick"),
-    "motion": Kind("with S2R, motion", "motion"),
     # Pipes
     "pipe": Kind("learned reward", "pipe", "pipe300"),
     "hand-made": Kind("hand-made reward", "pipe", "pipe300", HAND_MADE),
@@ -96,7 +95,7 @@ KINDS = {
     "narrowest": Kind("learned reward", "pipe", "pipe200"),
     "narrowest-hand-made": Kind("hand-made reward", "pipe", "pipe200", HAND_MADE),
 }
-BESIDE = ("payload", "quick", "motion")
+BESIDE = ("payload", "quick")
 PIPE_KINDS = tuple(name for name, kind in KINDS.items() if kind.task)
 
 
@@ -144,10 +143,9 @@ def trials(experiment: str, settings: Settings) -> list[Trial]:
     loads_g = (0, *settings.loads_g)
     for run in settings.runs:
         listed += [Trial(kind, *run) for kind in ("specified", "without")]
-        for kind in ("with", *settings.beside):
-            listed += [Trial(kind, *run, load_g=load_g) for load_g in ((0,) if kind == "motion" else loads_g)]
-            if kind in ("with", "motion"):
-                listed += [Trial(kind, *run, lap_s=lap_s) for lap_s in IN_TIME_S]
+        listed += [Trial("with", *run, load_g=load_g) for load_g in loads_g]
+        listed += [Trial("with", *run, lap_s=lap_s) for lap_s in IN_TIME_S]
+        listed += [Trial(kind, *run, load_g=load_g) for kind in settings.beside for load_g in loads_g]
     # Without S2R one seed is enough. Gradient descent is not trained, so it runs once for each load.
     for twin in settings.twins:
         listed.append(Trial("chambers", twin, settings.seeds[0]))

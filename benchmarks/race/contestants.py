@@ -2,11 +2,9 @@
 
     python -m benchmarks.race.contestants NAME SEED STRETCH_S N_GOALS
 
-NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
-quick (TQC) or analytic. The peers train through `learn` on the project's Gymnasium environment. They have the
-settings of quick, but for the temperature's learning rate, which they lack, and hindsight of their own, see
-`benchmarks.race.hindsight`. Learning rates fall along a half cosine over the preset's env steps. Our training
-then ends; the peers' rates begin anew.
+Ours is the loop of `python -m train reach` without its files. The peers have the settings of quick, but for
+the temperature's learning rate, which they lack, and hindsight of their own. Once quick's env steps are over,
+their learning rates begin anew.
 
 The clock counts from the program's start. It stands while the policy is evaluated and while PyTorch's threads
 are chosen. Start-up ends when a peer has done a first round of updates, and when ours has compiled.
@@ -86,7 +84,6 @@ def ours(name: str, seed: int) -> Contestant:
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     act = jax.jit(job.learner.mode)
 
-    # One round of training is one epoch.
     def train() -> None:
         nonlocal state
         state, _ = jax.block_until_ready(job.epoch(state))
@@ -95,12 +92,10 @@ def ours(name: str, seed: int) -> Contestant:
         epoch = int(state.n_epochs)
         return config.learner.n_env_steps(epoch), config.learner.n_updates(epoch)
 
-    return Contestant(
-        train,
-        policy=lambda obs: np.asarray(act(job.learner.policy(state.learner), obs)),
-        done=done,
-        limit=config.learner.total_env_steps,
-    )
+    def policy(obs: np.ndarray) -> np.ndarray:
+        return np.asarray(act(job.learner.policy(state.learner), obs))
+
+    return Contestant(train, policy, done, limit=config.learner.total_env_steps)
 
 
 def peer(name: str, seed: int) -> Contestant:
@@ -125,18 +120,18 @@ def peer(name: str, seed: int) -> Contestant:
         choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=ours.batch_size))
     uncounted_s = time.perf_counter() - start
     # The algorithm with our settings
-    hindsight = {
-        "arm": arms.env,
-        "hindsight": ours.hindsight,
-        "reward_scale": ours.reward_scale,
-        "seed": seed,
-    }
+    scale = ours.reward_scale
     model = algorithm(
         "MultiInputPolicy",
-        GoalEnvs(as_sb3(arms), ours.reward_scale),
+        GoalEnvs(as_sb3(arms), scale),
         seed=seed,
         replay_buffer_class=HindsightBuffer,
-        replay_buffer_kwargs=hindsight,
+        replay_buffer_kwargs={
+            "arm": arms.env,
+            "hindsight": ours.hindsight,
+            "reward_scale": scale,
+            "seed": seed,
+        },
         **settings_of(ours, lambda: n_steps),
     )
     model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
@@ -210,13 +205,11 @@ def prepare(
     """Return the facts and the rounds of a worker: each round is a stretch of training and an evaluation."""
     from mjx_softarm.env import ReachEnv
 
-    # Compile the evaluation.
     held_out = HeldOut(ReachEnv(), n_goals)
-    held_out.tip_error_mm(contestant.policy)
+    held_out.tip_error_mm(contestant.policy)  # compiles
     trained_s = 0.0
 
     def work() -> Facts:
-        # Train for a stretch of time.
         nonlocal trained_s
         start = time.perf_counter()
         while True:
@@ -226,7 +219,6 @@ def prepare(
             if ended or passed_s >= stretch_s:
                 break
         trained_s += passed_s
-        # Evaluate.
         median_mm = float(np.median(held_out.tip_error_mm(contestant.policy)))
         return {
             "wall_s": start_up_s + trained_s,

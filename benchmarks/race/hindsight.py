@@ -1,9 +1,7 @@
 """Hindsight for the peers: the arms in the form they need, and their own hindsight replay on it.
 
-Stable-Baselines3's `HerReplayBuffer` needs observations as a dictionary. It chooses which transitions get a
-goal that was reached later in their episode, and recomputes their reward. Here the observed error and the
-termination are recomputed, too, and as many goals as in ours are near the pose that was reached. The buffer
-cannot exchange actions: a saturated transition costs as much with its new goal as with its own.
+Beside the reward, the observed error and the termination are recomputed, and as many goals as in ours are
+near the pose reached. Actions are not exchanged: a saturated transition costs as much with its new goal.
 """
 
 from __future__ import annotations
@@ -60,12 +58,7 @@ class GoalEnvs(VecEnvWrapper):
 class HindsightBuffer(HerReplayBuffer):
     """`HerReplayBuffer` for arms at rest after each action, away from walls.
 
-    Args:
-        arm: environment that gives scales and rewards.
-        hindsight: shares of a batch that get another goal: reached later, or near the pose reached; above 0.
-        seed: of the goals near a pose.
-        reward_scale: factor of every stored reward.
-        settings: those of `HerReplayBuffer`.
+    `hindsight` has the shares of a batch that get another goal: reached later, or near the pose reached.
     """
 
     def __init__(
@@ -91,18 +84,15 @@ class HindsightBuffer(HerReplayBuffer):
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: Any = None
     ) -> DictReplayBufferSamples:
         """Return transitions with goals that were reached later, or near the pose reached."""
-        # Poses before and after, and goals that were reached later.
         where = batch_indices, env_indices
         reached = (poses["achieved_goal"][where] for poses in (self.observations, self.next_observations))
         scaled = (*reached, self._sample_goals(*where))
         before, after, goals = (poses * self._scale.scale + self._scale.centre for poses in scaled)
-        # Some goals are near the pose reached instead.
         draws = self._rng.random((2, len(after)), np.float32)
         near = draws[0] < self._hindsight.near_share / self.her_ratio
         direction = self._rng.standard_normal((len(after), 6), np.float32)
         offsets = near_offsets(jnp.asarray(draws[1]), jnp.asarray(direction))
         goals = np.where(near[:, None], after + np.asarray(offsets), goals)
-        # Rewards, observations and termination for the new goals.
         n_steps = (batch_indices - self.ep_start[where]) % self.buffer_size + 1
         saturated = self._saturated(after, n_steps, where)
         reward, reached, _ = rewards.reward(after, goals, n_steps, saturated, self._config)

@@ -1,12 +1,8 @@
 """Wall time and env steps until the median tip error at held-out goals has come down to a level.
 
-The contestants are ours, and TQC of SBX and of Stable-Baselines3-contrib, on the same arms, goals and
-evaluation; `contestants` says how each trains. They run one after another, each in a process of its own with
-all cores. Ours with the presets quick and analytic go first; analytic trains to the finest level, or to its
-end. A peer is stopped when it has reached all levels that quick has, or when its targets are met.
-
-Results stay in the working folder: the same command continues an interrupted race, and adds seeds.
-A target compares one of our presets with a peer: TQC with TQC, and learning through the equilibrium with SBX.
+`contestants` says how each trains. They run one after another, in processes of their own with all cores: our
+presets first, then TQC of SBX and of Stable-Baselines3-contrib on the same arms and goals. A peer is stopped
+when it has reached all levels that quick has, or when its targets are met.
 """
 
 from __future__ import annotations
@@ -67,10 +63,7 @@ def race(seeds: cli.Integers = (0,), out: Path = Path("runs/race")) -> int:
 
     Args:
         seeds: of training
-        out: working folder
-
-    Raises:
-        InputError: one of ours failed, or the folder has results of other conditions.
+        out: working folder: the same command continues, and seeds may be added
     """
     made = provenance("benchmarks")
     conditions = {name: made[name] for name in ("packages", "commit")}
@@ -84,10 +77,7 @@ def race(seeds: cli.Integers = (0,), out: Path = Path("runs/race")) -> int:
 def run(folder: Path, seed: int) -> list[Facts]:
     """Return the results of all contestants; those that the folder lacks are measured.
 
-    A peer that fails has `failed` in place of points.
-
-    Raises:
-        InputError: one of ours failed.
+    A peer that fails has `failed` in place of points; one of ours raises its error.
     """
     results: list[Facts] = []
     for name in CONTESTANTS:
@@ -190,9 +180,9 @@ def _row(result: Result, axis: str) -> dict[str, Any]:
 
 
 def judge(wanted: PeerTarget, results: Sequence[Result]) -> dict[str, str]:
-    """Judge a target: how many times our wall time a peer takes, median over seeds.
+    """Judge how many times our wall time a peer takes, median over seeds.
 
-    A peer that was stopped before the level counts with the time that it had, which may show nothing.
+    One that was stopped before the level counts with the time that it had, which may show nothing.
     """
     peer, times, ours = wanted
     text = f"{peer}: wall time to {TARGET_MM} mm, with start-up, at least {times:g} times that of {ours}"

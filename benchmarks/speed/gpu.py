@@ -1,7 +1,6 @@
-"""Speed of a GPU: environment steps a second at many sizes, and times to train.
+"""Speed of a GPU: environment steps a second at many sizes, and times to train with sizes for a GPU.
 
-A training is a sweep over seeds with sizes for a GPU. Its clock runs in its epochs alone: it stands while
-programs compile and policies are evaluated.
+The clock of a training stands while programs compile and policies are evaluated.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any
 
 from benchmarks.harness.common import machine_kind
 from benchmarks.harness.stages import EVALUATION_FILE, command
-from benchmarks.speed.jax_worker import mesh_of_cores
+from benchmarks.speed.jax_worker import split_cpu
 from benchmarks.speed.throughput import rows_of
 from mjx_softarm._support import cli
 from train.sweep import open_members
@@ -45,7 +44,7 @@ def measure(keep: cli.MaybePath = None) -> dict[str, Any]:
     Args:
         keep: folder for the runs; without one they are deleted
     """
-    mesh_of_cores(1)  # devices are made before JAX is used
+    split_cpu()
     with tempfile.TemporaryDirectory() as folder:
         home = (keep or Path(folder)).absolute()
         home.mkdir(parents=True, exist_ok=True)
@@ -55,11 +54,7 @@ def measure(keep: cli.MaybePath = None) -> dict[str, Any]:
 
 
 def training(preset: str, sweep: Path) -> list[dict[str, Any]]:
-    """Train with some seeds at once; return a row for each, with its times to each level of `LEVELS_MM`.
-
-    Raises:
-        InputError: the training failed.
-    """
+    """Train with some seeds at once; return a row for each, with its times to each level of `LEVELS_MM`."""
     seeds, options = TRAININGS[preset]
     asked = ("train", "sweep", "--preset", preset, "--seeds", seeds, *options, "--out", sweep)
     command(sweep.with_suffix(".log"), *asked, makes=sweep / "results.json")
@@ -72,11 +67,7 @@ def training(preset: str, sweep: Path) -> list[dict[str, Any]]:
 
 
 def times_to(metrics: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """Return the seconds of training, and those after which the median error was first below each level.
-
-    Args:
-        metrics: rows of a run's `metrics.jsonl`, one for each epoch.
-    """
+    """Return the seconds of training, of a run's metrics, and those to the first median below each level."""
     seconds, before, times = 0.0, 0, dict.fromkeys(LEVELS_MM)
     for row in metrics:
         seconds += (row["env_steps"] - before) / row["speed/env_steps_per_s"]

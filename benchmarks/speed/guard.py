@@ -55,22 +55,16 @@ def main(store: bool = False) -> int:
 
     Args:
         store: make this the baseline of this kind of machine.
-
-    Raises:
-        InputError: there is no baseline, a process failed, or the baseline is too uncertain to be stored.
     """
-    # The baseline of this kind of machine.
     kind, kinds = cpu_kind(), json.loads(FILE.read_text("utf-8"))["kinds"] if FILE.exists() else {}
     stored = kinds.get(kind, {})
     if not store and stored.get("sizes") != SIZES:
         raise InputError(f"{FILE}: got no baseline of this work on {kind}, expected one: guard --store")
     samples = [process_costs() for _ in range(N_STORED if store else N_PROCESSES)]
-    # Compare with it.
     if not store:
         rows = compare(stored["costs"], samples)
         show({"costs": rows}, f"guard, {kind}, baseline of commit {stored['commit']}")
         return WORSE if any(row["verdict"] == "WORSE" for row in rows) else 0
-    # Or store a new one, if it is certain enough.
     costs = baseline_of(samples)
     show({"costs": costs}, f"baseline of {kind}")
     if loose := [name for name, row in costs.items() if row["tolerance"] > MOST_TOLERANCE]:
@@ -82,11 +76,7 @@ def main(store: bool = False) -> int:
 
 
 def process_costs() -> dict[str, float]:
-    """Return the costs that one process on one core measures, by the name of the work.
-
-    Raises:
-        InputError: the process failed.
-    """
+    """Return the costs that one process on one core measures, by the name of the work."""
     words = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0))), sys.executable, "-m", MODULE]
     done = subprocess.run(words, stdout=subprocess.PIPE, text=True, cwd=ROOT, check=False)
     if done.returncode:

@@ -8,7 +8,6 @@ It reports where the arms settled.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import sys
 import time
 from collections.abc import Callable
@@ -18,8 +17,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from benchmarks.harness.common import n_cores
-from benchmarks.harness.rounds import Facts, serve
+from benchmarks.harness.rounds import Facts, n_cores, serve
 from benchmarks.speed.truth import REPORTED
 from mjx_softarm._support import draws, xla
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -46,41 +44,33 @@ class Program(NamedTuple):
     n_updates: int = 0  # gradient steps in a call
 
 
-def mesh_of_cores(n_arms: int) -> Mesh | None:
-    """Make devices of this process's cores, as many as n arms spread over evenly; call it before JAX is used.
+def split_cpu() -> None:
+    """Make each core of this process a device; call it before JAX is used.
 
     XLA runs most of settling on one core, so a CPU that is one device leaves the others idle.
-
-    Returns:
-        None for a single device: on a GPU, or where the arms cannot be spread evenly.
     """
-    _make_devices()
-    n = max(n for n in range(1, n_cores() + 1) if n_arms % n == 0)
-    return Mesh(np.array(jax.devices()[:n]), ("arms",)) if n > 1 and jax.default_backend() == "cpu" else None
+    jax.config.update("jax_num_cpu_devices", n_cores())
 
 
-def spread(mesh: Mesh | None) -> NamedSharding | None:
-    """Return the sharding of arrays whose first axis is spread over the devices; None for one device."""
-    return NamedSharding(mesh, PartitionSpec(mesh.axis_names)) if mesh else None
+def mesh_of(n_arms: int, n_devices: int = 1) -> Mesh:
+    """Return the first devices, which share n arms; instead of one CPU, as many cores as divide n."""
+    if n_devices == 1 and jax.default_backend() == "cpu":
+        n_devices = max(n for n in range(1, jax.device_count() + 1) if n_arms % n == 0)
+    return Mesh(np.array(jax.devices()[:n_devices]), ("arms",))
 
 
-def of_shares(function: Callable, mesh: Mesh | None, axis: int = 0) -> Callable:
+def spread(mesh: Mesh) -> NamedSharding:
+    """Return the sharding of arrays whose first axis is that of the arms."""
+    return NamedSharding(mesh, PartitionSpec(mesh.axis_names))
+
+
+def of_shares(function: Callable, mesh: Mesh, axis: int = 0) -> Callable:
     """Return a function of arms of which each device computes its share, and waits for no other's arms.
 
-    Args:
-        function: of arrays whose first axis is that of the arms.
-        mesh: devices; None for one.
-        axis: axis of the arms in its results.
+    The arms are the first axis of its arrays, and `axis` of its results.
     """
-    if mesh is None:
-        return function
     arms, results = PartitionSpec(mesh.axis_names), PartitionSpec(*[None] * axis, mesh.axis_names)
     return jax.shard_map(function, mesh=mesh, in_specs=arms, out_specs=results, check_vma=False)
-
-
-@functools.cache
-def _make_devices() -> None:
-    jax.config.update("jax_num_cpu_devices", n_cores())
 
 
 def digits(rate: float) -> float | int:
@@ -101,15 +91,14 @@ def rates(program: Program, seconds: float) -> Facts:
     return {name: count / each_s for name, count in done.items() if count}
 
 
-def rollout(engine: Any, mode: Any, n: int, mesh: Mesh | None = None) -> Program:
+def rollout(engine: Any, mode: Any, n: int, mesh: Mesh) -> Program:
     """Compile a rollout of n arms with random actions, which saturate about half of the chambers.
 
     A call returns, for each step, `unsettled`, `saturated_chambers`, references [m] and tips [mm].
     """
     n_steps = N_STEPS[mode] if n <= N_FEW else 1
     env = ReachEnv(config=EnvConfig(engine=engine, mode=mode, n_poses=N_POSES))
-    n_devices = mesh.size if mesh else 1
-    arms = VectorEnv(env, n // n_devices, EPISODE_LENGTH)  # of a device
+    arms = VectorEnv(env, n // mesh.size, EPISODE_LENGTH)  # of a device
 
     def run(state: Any, keys: jax.Array) -> Any:
         def step(state: Any, key: jax.Array) -> Any:
@@ -125,7 +114,7 @@ def rollout(engine: Any, mode: Any, n: int, mesh: Mesh | None = None) -> Program
     few = VectorEnv(env, min(n, N_STARTS), EPISODE_LENGTH)
     state = xla.jit(few.reset, "once")(jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.resize(x, (n, *x.shape[1:])), jax.device_get(state))
-    keys = jax.random.split(jax.random.PRNGKey(1), n_devices)
+    keys = jax.random.split(jax.random.PRNGKey(1), mesh.size)
     state, keys = jax.device_put((state, keys), spread(mesh))
     # Compile
     start = time.perf_counter()
@@ -163,7 +152,8 @@ def resized(preset: str, n_arms: int, **settings: Any) -> TrainConfig:
 def steps(engine: Any, mode: Any, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare rounds of `rollout`; in motion they have the simulated time of all arms together, too."""
     xla.enable_compilation_cache()
-    program = rollout(engine, mode, int(n_arms), mesh_of_cores(int(n_arms)))
+    split_cpu()
+    program = rollout(engine, mode, int(n_arms), mesh_of(int(n_arms)))
     _, _, *ends = program.call()
     facts: Facts = {"arms": int(n_arms), "compile_s": round(program.compile_s, 1)}
     if mode == "quasistatic":  # first step first

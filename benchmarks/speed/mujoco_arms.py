@@ -1,9 +1,7 @@
 """Arms without this project's solver: C MuJoCo stepped in time under the control law until each arm rests.
 
-Control law and rate are those of `ReachEnv`; the damping is the arm's own. It takes seconds of simulated
-time: the arm swings until its damping has stopped it, and the law's gains limit how fast a chamber fills.
-Stopping earlier is cheaper but ends further from the equilibrium. So each rate has the error of the arms'
-resting place beside it.
+It takes seconds of simulated time. Stopping earlier is cheaper but ends further from the equilibrium, so each
+rate has the error of the arms' resting place beside it.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     python -m benchmarks.speed.mujoco_worker rollout N_THREADS      MuJoCo's own threaded rollout
 
 A step holds the references of a random action until the arm rests. Observation and reward are left out:
-beside some 25 ms of physics they take no time. Both report where the arms stopped.
+beside some 25 ms of physics they take no time.
 """
 
 from __future__ import annotations
@@ -48,12 +48,10 @@ def prepare(kind: str, n: str) -> tuple[Facts, Callable[[], Facts]]:
         n_arms = ARMS_PER_THREAD * int(n)
         step = SteppedArms(SPEC, n_arms, int(n)).settle
     else:
-        from stable_baselines3.common.vec_env import (  # pyright: ignore[reportMissingImports]
-            SubprocVecEnv,
-        )
+        from stable_baselines3.common import vec_env  # pyright: ignore[reportMissingImports]
 
         n_arms = int(n)
-        envs = SubprocVecEnv([SteppedEnv] * n_arms)
+        envs = vec_env.SubprocVecEnv([SteppedEnv] * n_arms)
         envs.reset()
 
         def step(reference_m: np.ndarray) -> SteppedRest:

@@ -1,9 +1,7 @@
 """Speed and error of methods that find an arm's equilibrium, over links per section.
 
-The methods are Newton's method with the closed-form chain, the same with MJX's pass at its solution, and C
-MuJoCo stepped in time under the control law. They take turns, on all cores. Errors are distances of the tip
-from the solution in double precision, which `tests/mechanics/test_settle.py` compares with C MuJoCo stepped
-to rest.
+They are Newton's method with the closed-form chain, the same with MJX's pass at its solution, and C MuJoCo
+stepped in time. They take turns, on all cores; errors are distances of the tip from `truth.true_rest`.
 """
 
 from __future__ import annotations
@@ -15,8 +13,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from benchmarks.harness.common import n_cores
-from benchmarks.speed.jax_worker import Program, digits, mesh_of_cores, of_shares, rates, spread
+from benchmarks.harness.rounds import n_cores
+from benchmarks.speed.jax_worker import Program, digits, mesh_of, of_shares, rates, split_cpu, spread
 from benchmarks.speed.mujoco_arms import SteppedArms
 from benchmarks.speed.truth import Truth, error_figures, random_references, settle_function, true_rest
 from mjx_softarm._support import xla
@@ -31,11 +29,12 @@ N_ROUNDS, ROUND_S = 3, 1.0
 
 def measure() -> dict[str, Any]:
     """How fast and how exactly is an arm's equilibrium found?"""
-    mesh = mesh_of_cores(N_ARMS)
+    split_cpu()
+    mesh = mesh_of(N_ARMS)
     return {"over_links": [row for links in LINKS for row in methods_rows(links, mesh)]}
 
 
-def methods_rows(links: int, mesh: Mesh | None) -> list[dict[str, Any]]:
+def methods_rows(links: int, mesh: Mesh) -> list[dict[str, Any]]:
     """Return a row for each method, with a number of links per section."""
     # Functions that return tips [m]; the first call of each compiles.
     spec = ArmSpec.default().replace(structure={"links_per_section": links})
@@ -66,7 +65,7 @@ def methods_rows(links: int, mesh: Mesh | None) -> list[dict[str, Any]]:
     return rows
 
 
-def _solver(spec: ArmSpec, engine: str, reference_m: np.ndarray, mesh: Mesh | None) -> Callable[[], Any]:
+def _solver(spec: ArmSpec, engine: str, reference_m: np.ndarray, mesh: Mesh) -> Callable[[], Any]:
     """Return a function that settles references (n, n_springs) [m] and returns tips (n, 3) [m]."""
     solve = xla.jit(of_shares(settle_function(spec, engine), mesh))
     placed = jax.device_put(reference_m.astype(np.float32), spread(mesh))

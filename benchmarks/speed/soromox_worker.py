@@ -2,15 +2,14 @@
 
     python -m benchmarks.speed.soromox_worker METHOD N_ARMS
 
-The arm is this project's as a piecewise-constant-strain robot, one segment for each section. It bends and
-stretches; without torsion and shear, the stiffest motions, an explicit step may be three times as long. Each
-round holds random pressures, as forces on the segments, and has neither a control law nor valves. METHOD is
+The arm has one segment of constant strain for each section. It bends and stretches; without torsion and
+shear, the stiffest motions, an explicit step may be three times as long. Each round holds random pressures,
+as forces on the segments, and has neither a control law nor valves. METHOD is
 
-    explicit    Euler's step on SoRoMoX's accelerations, the longest that is stable. Its limit is 0.85 ms at
-                the fastest decay seen, 2,340 per second. Runge-Kutta methods allow 1.0 to 1.8 times that, at
-                two to six times the cost.
+    explicit    Euler's step on SoRoMoX's accelerations, the longest that is stable. Runge-Kutta methods allow
+                1.0 to 1.8 times that, at two to six times the cost.
     implicit    the linearised midpoint rule of `mjx_softarm.mechanics.motion.midpoint` on SoRoMoX's inertia
-                and forces, with a control period's step. It is not SoRoMoX's own.
+                and forces, with a control period's step
 
 Source: SoRoMoX, https://github.com/tud-phi/soromox.
 """
@@ -18,7 +17,6 @@ Source: SoRoMoX, https://github.com/tud-phi/soromox.
 from __future__ import annotations
 
 import math
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -26,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.rounds import Facts, serve
+from benchmarks.harness.rounds import Facts, n_cores, serve
 from mjx_softarm.mechanics.body import chamber_directions, holes_m
 from mjx_softarm.spec import ArmSpec
 
@@ -77,7 +75,6 @@ def build_robot(spec: ArmSpec) -> Any:
     from soromox.systems import PCS, PCSStructure  # pyright: ignore[reportMissingImports]
     from soromox.systems.components import LinkSpec  # pyright: ignore[reportMissingImports]
 
-    # Radius and mass of each section
     geometry, n = spec.geometry, spec.structure.n_sections
     radius_m = np.add(
         spec.per_section(geometry.chamber_radius_m),
@@ -86,7 +83,6 @@ def build_robot(spec: ArmSpec) -> Any:
     mass_kg = np.array(spec.section_mass_kg)
     mass_kg[-1] += spec.mass.gripper_kg + spec.mass.payload_kg
 
-    # A segment for each
     stiffness, damping = (section_matrices(spec, kind) for kind in ("stiffness", "damping"))
     links = [
         LinkSpec.circular(
@@ -128,12 +124,9 @@ def stepper(robot: Any, method: str, step_s: float) -> Callable[[Any, Any], Any]
 def move(method: str, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare n arms, and check that they stay finite for `CHECKED_S`."""
     import jax
-
-    n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", n_cores)  # XLA runs most of this on one core of a device
     from jax.sharding import Mesh, PartitionSpec
 
-    # A step of one arm, and one of all arms over the time that a set of pressures is held.
+    jax.config.update("jax_num_cpu_devices", n_cores())  # XLA runs most of this on one core of a device
     spec, n, rng = ArmSpec.default(), int(n_arms), np.random.default_rng(0)
     step_s = HELD_S / N_STEPS[method]
     step = stepper(build_robot(spec), method, step_s)
@@ -144,8 +137,7 @@ def move(method: str, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     mesh = Mesh(np.array(jax.devices()[: math.gcd(n, len(jax.devices()))]), ("arms",))
     split, many = PartitionSpec("arms"), jax.vmap(held)
     run = jax.jit(jax.shard_map(many, mesh=mesh, in_specs=split, out_specs=split, check_vma=False))
-    # Arms at rest.
-    state = np.zeros((n, 6 * spec.structure.n_sections), np.float32)  # strains and their rates
+    state = np.zeros((n, 6 * spec.structure.n_sections), np.float32)  # at rest: strains and their rates
     calls = 1
 
     def work() -> Facts:

@@ -1,9 +1,7 @@
 """Environment steps and gradient steps a second of this machine; on request beside other simulators.
 
-Random actions saturate about half of the chambers. With `--peers`, each program is a process of its own, and
-they take turns round by round; one that fails has a row that says why. All programs of a table have the same
-cores. C MuJoCo's arms are stepped in time until they rest (`benchmarks.speed.mujoco_arms`); the distance from
-the true equilibrium stands beside each rate. In motion, programs are compared by simulated seconds.
+Random actions saturate about half of the chambers. Other simulators' programs take turns with ours, on the
+same cores; beside each rate stands the distance from the true equilibrium.
 """
 
 from __future__ import annotations
@@ -15,10 +13,10 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from benchmarks.harness.common import machine_kind, n_cores, show
+from benchmarks.harness.common import machine_kind, show
 from benchmarks.harness.peers import peer_python
-from benchmarks.harness.rounds import Worker, take_turns
-from benchmarks.speed.jax_worker import N_POSES, digits, mesh_of_cores, rates, resized, rollout, training
+from benchmarks.harness.rounds import Worker, n_cores, take_turns
+from benchmarks.speed.jax_worker import N_POSES, digits, mesh_of, rates, resized, rollout, split_cpu, training
 from benchmarks.speed.truth import REPORTED, reported_error
 from mjx_softarm._support import cli, xla
 from mjx_softarm._support.errors import InputError
@@ -44,6 +42,7 @@ def measure(
     mode: tuple[Mode, ...] = (),
     seconds: float = 1.0,
     train: bool = False,
+    devices: int = 1,
     peers: bool = False,
     json: cli.MaybePath = None,
 ) -> int:
@@ -55,18 +54,18 @@ def measure(
         mode: quasistatic (at rest), dynamic (in motion); none: both
         seconds: time to measure each row
         train: rollouts with updates on one device, as the presets quick and motion have them
+        devices: how many JAX devices share the arms evenly; 1: one, or all cores of a CPU
         peers: instead, beside C MuJoCo, SubprocVecEnv and SoRoMoX; takes half an hour
         json: file for the figures; None: none is written
-
-    Raises:
-        InputError: an option is out of range, or the options do not go together.
     """
     if json and not json.parent.is_dir():
         raise InputError(f"--json: got {json}, expected a file in a folder that exists")
     if any(n < 1 for n in arms):
         raise InputError(f"--arms: got {' '.join(map(str, arms))}, expected numbers from 1")
+    if train and devices != 1:
+        raise InputError(f"--devices: got {devices}, expected 1 with --train")
     if peers:
-        if arms or engine or mode or train:
+        if arms or engine or mode or train or devices != 1:
             raise InputError("--peers: got other options too, expected --json at most")
         figures = beside_peers()
         show(figures, "throughput beside other simulators")
@@ -76,11 +75,16 @@ def measure(
         if not pairs:
             raise InputError(f"--engine: got {' '.join(engine)}, expected one with --mode {' '.join(mode)}")
         xla.enable_compilation_cache()
-        if not train:
-            mesh_of_cores(1)  # devices are made before JAX is used
+        if not train and devices == 1:
+            split_cpu()
+        if not 1 <= devices <= jax.device_count():
+            raise InputError(f"--devices: got {devices}, expected 1 to {jax.device_count()}")
         sizes = arms or (64, 1024, 8192, *((65_536,) if jax.default_backend() == "gpu" else ()))
-        rows = rows_of([(*pair, n) for n in sizes for pair in pairs], seconds, train)
-        figures = {"machine": machine_kind(), "seconds": seconds, "train": train, "rows": rows}
+        if odd := [n for n in sizes if n % devices]:
+            raise InputError(f"--arms: got {odd[0]}, expected a multiple of {devices} devices")
+        rows = rows_of([(*pair, n) for n in sizes for pair in pairs], seconds, train, devices)
+        setting = {"machine": machine_kind(), "seconds": seconds, "train": train, "devices": devices}
+        figures = {**setting, "rows": rows}
     if json:
         write_json(json, {**figures, **provenance("benchmarks")})
         print(f"written: {json}")
@@ -88,18 +92,20 @@ def measure(
 
 
 def rows_of(
-    points: Sequence[tuple[Any, Any, int]], seconds: float, train: bool = False
+    points: Sequence[tuple[Any, Any, int]], seconds: float, train: bool = False, devices: int = 1
 ) -> list[dict[str, Any]]:
     """Measure this project's programs of engine, mode and arms; print a row of each once it is measured."""
     print(f"{machine_kind()}\n{HEAD}", flush=True)
     rows = []
     for point in points:
-        rows.append(row_of(*point, seconds, train))
+        rows.append(row_of(*point, seconds, train, devices))
         print(line_of(rows[-1]), flush=True)
     return rows
 
 
-def row_of(engine: Engine, mode: Mode, n_arms: int, seconds: float, train: bool) -> dict[str, Any]:
+def row_of(
+    engine: Engine, mode: Mode, n_arms: int, seconds: float, train: bool, devices: int
+) -> dict[str, Any]:
     """Compile and measure a program; return its figures, or why it failed."""
     row: dict[str, Any] = {"engine": engine, "mode": mode, "arms": n_arms}
     try:
@@ -108,7 +114,7 @@ def row_of(engine: Engine, mode: Mode, n_arms: int, seconds: float, train: bool)
             env = dataclasses.replace(config.env, engine=engine, n_poses=N_POSES)
             program = training(dataclasses.replace(config, env=env))
         else:
-            program = rollout(engine, mode, n_arms, mesh_of_cores(n_arms))
+            program = rollout(engine, mode, n_arms, mesh_of(n_arms, devices))
         figures = {name: digits(rate) for name, rate in rates(program, seconds).items()}
     except jax.errors.JaxRuntimeError as error:  # such as too little memory
         return row | {"failed": str(error).splitlines()[0]}

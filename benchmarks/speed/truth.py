@@ -1,7 +1,4 @@
-"""The true equilibrium, the settled arm's distance from it, and random references.
-
-The truth is the solution in double precision; `tests/mechanics/test_settle.py` holds it against C MuJoCo.
-"""
+"""The true equilibrium: the solution in double precision, which `tests/mechanics` hold against C MuJoCo."""
 
 from __future__ import annotations
 
@@ -56,10 +53,7 @@ def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
 
 
 def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
-    """Return median, 95 % and largest distance of tips (n, 3) [mm] from their equilibria.
-
-    Arms without a truth are left out; `without_truth` counts them.
-    """
+    """Return quantiles of the distance of tips (n, 3) [mm] from their equilibria, where those are known."""
     error = np.linalg.norm(np.asarray(tip_mm, np.float64) - truth.tip_mm, axis=-1)[truth.settled]
     errors = {name: float(f"{np.quantile(error, share):.3g}") for name, share in QUANTILES.items()}
     return {**errors, "without_truth": int(np.sum(~truth.settled))}

@@ -7,7 +7,6 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import soromox_arm
 from benchmarks.accuracy.soromox_arm import fibre_energy
 from benchmarks.harness.rounds import ROOT
 from mjx_softarm.twin.rod_twin import RodTwin
@@ -26,13 +25,6 @@ def test_fibres_pull_as_those_of_a_rod():
         pulls = jax.grad(lambda x: fibre_energy(x, pressure_kpa, parts).sum())(stretch) / full_m
     expected, _ = rod._fibres((full_m * stretch).reshape(-1, n_fibres), pressure_kpa)
     np.testing.assert_allclose(np.asarray(pulls).reshape(expected.shape), expected, rtol=1e-9)
-
-
-def test_its_axes_are_right_handed_and_it_hangs_down():
-    axes = soromox_arm._AXES
-    np.testing.assert_array_equal(axes @ [1.0, 0.0, 0.0], [0.0, 0.0, -1.0])
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3))
-    assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from tests.benchmarks.paper.made_up import make_policy
 
 SPEC = ArmSpec.default()
 N = SPEC.n_chambers
-TINY = Settings(twins=(0, 1), seeds=(0,), n_points=3, loads_g=(500, 1000), beside=("payload", "motion"))
+TINY = Settings(twins=(0, 1), seeds=(0,), n_points=3, loads_g=(500, 1000), beside=("payload",))
 
 
 def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp_path, make_arm_model):
@@ -94,7 +94,7 @@ S2R, GRADIENT, PIPE_SHOWN = "with S2R, 0 g: ", "gradient descent, 0 g: ", "learn
         ("open", {HEAVY: {"off_g": 800.0, "reported": 1}}, ["with S2R: mean of load_off_g"]),
         ("open", {OBSERVED: {"mm": 12.1}}, [f"{PAYLOAD}mean of trans", f"{PAYLOAD}max of max_mm"]),
         ("open", {t: {} for t in trials("open", TINY) if t.kind == "gradient"}, [f"{GRADIENT}sum of satur"]),
-        ("open", {Trial("motion", 1, 0): {"missed": 1}}, ["all kinds: sum of missed"]),
+        ("open", {Trial("specified", 1, 0): {"missed": 1}}, ["all kinds: sum of missed"]),
         ("confined", {}, []),
         ("confined", {PIPE: {"mm": 10.0}}, [f"{PIPE_SHOWN}mean of x_mm"]),
         ("confined", {PIPE: {"fails": 1}}, ["learned reward, as shown, exchanged: both_orders of all_done"]),

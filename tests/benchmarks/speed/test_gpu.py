@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.harness import common
-from benchmarks.speed import gpu, throughput
+from benchmarks.speed import gpu
 
 
 def test_the_clock_of_a_training_runs_in_its_epochs():
@@ -21,8 +21,7 @@ def test_the_clock_of_a_training_runs_in_its_epochs():
 @pytest.mark.slow
 def test_smoke(tmp_path, monkeypatch):
     monkeypatch.setattr(common, "RESULTS", tmp_path)
-    for module in (gpu, throughput):  # JAX has been used: no more devices
-        monkeypatch.setattr(module, "mesh_of_cores", lambda n: None)
+    monkeypatch.setattr(gpu, "split_cpu", lambda: None)  # JAX has been used: no more devices
     monkeypatch.setattr(gpu, "STEPS", {("chain", "quasistatic"): (8,)})
     tiny = ("--learner.n-arms", "16", "--learner.total-env-steps", "1024", "--env.n-poses", "256")
     monkeypatch.setattr(gpu, "TRAININGS", {"analytic": ("0,1", tiny)})

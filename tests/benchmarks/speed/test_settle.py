@@ -3,6 +3,7 @@
 import numpy as np
 
 from benchmarks.speed import settle
+from benchmarks.speed.jax_worker import mesh_of
 from benchmarks.speed.truth import Truth, error_figures
 
 
@@ -17,7 +18,7 @@ def test_smoke(monkeypatch):
     for name, value in (("N_ARMS", 8), ("N_STEPPED", 2), ("N_ROUNDS", 2), ("ROUND_S", 0.01)):
         monkeypatch.setattr(settle, name, value)
     monkeypatch.setattr(settle, "MOST_LINKS_MJX", 1)
-    chain, mjx, stepping = settle.methods_rows(2, None)
+    chain, mjx, stepping = settle.methods_rows(2, mesh_of(8))
     assert mjx["skipped"] == settle.NO_MJX and chain["max_mm"] < 0.01 and stepping["max_mm"] < 1.5
     assert min(chain["solves_per_s"], stepping["solves_per_s"]) > 0
     assert chain["share_at_limit"] == stepping["share_at_limit"] > 0.2

@@ -1,14 +1,18 @@
 """The throughput benchmark: C MuJoCo's rest against the solver, rows of programs that take turns."""
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
+from benchmarks.harness.rounds import ROOT
 from benchmarks.speed import jax_worker, throughput
 from benchmarks.speed.jax_worker import Program, rates
-from benchmarks.speed.mujoco_arms import REST_M, REST_S, RestDetector, SteppedArms, SteppedEnv
+from benchmarks.speed.mujoco_arms import REST_S, SteppedArms, SteppedEnv
 from benchmarks.speed.truth import error_figures, random_references, reported_error, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
@@ -48,16 +52,6 @@ def test_the_error_of_a_worker_s_answers_is_that_of_their_tips(reference, truth)
     assert reported_error(SPEC, [{"arms": 2}]) == {}
 
 
-def test_an_arm_rests_when_no_spring_has_moved_for_long_enough():
-    rest, n_quiet = RestDetector(2, SPEC), round(REST_S * SPEC.control.rate_hz)
-    still, ticks = np.zeros(9), []
-    for tick in range(3 * n_quiet):
-        moving = np.where(np.arange(9) == 4, 1.1 * REST_M * min(tick, 10), 0.0)  # the second arm stops later
-        ticks.append(rest.settled(np.stack([still, moving]), np.arange(2)))
-    first = np.argmax(np.array(ticks), axis=0)
-    assert first[0] == n_quiet and first[1] == n_quiet + 10
-
-
 def test_programs_beside_others_have_a_row_each_or_a_reason(monkeypatch):
     def take_turns(workers, n_rounds):
         answers = [{"env_steps_per_s": rate} for rate in (100.0, 5.678, 200.4)]
@@ -89,7 +83,7 @@ def test_rates_leave_out_the_first_call_unless_it_is_long(monkeypatch):
 
 @pytest.mark.parametrize("train", [False, True])
 def test_smoke(train, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(throughput, "mesh_of_cores", lambda n: None)  # JAX has been used: no more devices
+    monkeypatch.setattr(throughput, "split_cpu", lambda: None)  # JAX has been used: no more devices
     file, options = tmp_path / "speed.json", ["--train"] * train
     words = ["--arms", "8", "--engine", "chain", "--mode", "quasistatic", "--seconds", "0.1"]
     assert main(["throughput", *words, "--json", str(file), *options]) == 0
@@ -100,12 +94,44 @@ def test_smoke(train, tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().out.splitlines()[2].split()[:3] == ["chain", "quasistatic", "8"]
 
 
+ON_TWO = """
+import sys
+from benchmarks.__main__ import main
+from benchmarks.speed import throughput
+measured = throughput.rates
+
+def rates(program, seconds):
+    print("tips on", sorted(device.id for device in program.call()[-1].sharding.device_set))
+    return measured(program, seconds)
+
+throughput.rates = rates
+sys.exit(main(["throughput", "--devices", "2", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize(("n_arms", "status"), [("4", 0), ("3", 2)])
+def test_devices_share_the_arms(n_arms, status, tmp_path):
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    words = ["--engine", "chain", "--mode", "quasistatic", "--seconds", "0.1", "--json", tmp_path / "a.json"]
+    command = [sys.executable, "-c", ON_TWO, "--arms", n_arms, *words]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == status, done.stderr
+    if status:
+        assert done.stderr == "error: --arms: got 3, expected a multiple of 2 devices\n"
+    else:
+        assert "tips on [0, 1]\n" in done.stdout
+        assert json.loads((tmp_path / "a.json").read_text())["devices"] == 2
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--arms", "0"], "--arms: got 0"),
         (["--engine", "chain", "--mode", "dynamic"], "--engine: got chain"),
         (["--json", "absent/speed.json"], "expected a file in a folder"),
+        (["--devices", "0"], "--devices: got 0, expected 1 to "),
+        (["--devices", "1000"], "--devices: got 1000, expected 1 to "),
+        (["--train", "--devices", "2"], "--devices: got 2, expected 1 with --train"),
         (["--peers", "--train"], "--peers: got other options too"),
     ],
 )
