@@ -115,12 +115,7 @@ def policy_rows(settings: Settings, name: str, seed: int) -> list[dict[str, Any]
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     for _ in range(config.learner.n_epochs):
         state, _ = job.epoch(state)
-<<<<<<< HEAD
     policy = jax.device_get(job.learner.policy(state.learner))
-    # Follow paths of goals.
-=======
-    policy = jax.device_get(job.policy(state))
->>>>>>> sub-bench
     loaded = Randomisation(payload_max_kg=LARGEST_KG)
     env_config = EnvConfig(engine="chain", observation=config.env.observation, randomisation=loaded)
     env = kind.env(spec, env_config)
