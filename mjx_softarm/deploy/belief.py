@@ -25,7 +25,7 @@ from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.hysteresis import stop_after
 from mjx_softarm.sensing.load import KNOWN, Load, averaged, estimate_load, holds_payload
-from mjx_softarm.sensing.sensors import Sensor, SensorFault
+from mjx_softarm.sensing.sensors import Sensor
 
 STUCK_RANGE_M = 1e-5  # range of a stuck sensor over a window; a live one's noise is larger
 STUCK_PRESSURE_KPA = 2.0  # range of its chamber's pressure at which a live one moves; by hand
@@ -79,7 +79,7 @@ class Belief:
         springs = np.zeros(n_springs, int), np.zeros(n_springs, bool)
         chambers = np.zeros(n_chambers, int), np.zeros(n_chambers, bool)
         unknown_m = np.full(n_springs, np.nan)
-        load = Load.assumed(spec.mass.payload_kg)
+        load = Load(spec.mass.payload_kg, assumed_kg=spec.mass.payload_kg)
         return cls(
             controller, Command.none(spec), window, unknown_m, *springs, *chambers, load, np.zeros(n_chambers)
         )
@@ -197,7 +197,7 @@ def _with_load(belief: Belief, last: Belief) -> Belief:
     mean_kpa = belief.window.chamber_kpa.mean(axis=0)
     estimate_kg, width_kg = map(float, estimate_load(model, belief.mean_m, mean_kpa, belief.stop))
     if not holds_payload(estimate_kg, width_kg, most_kg):
-        load = Load.assumed(load.assumed_kg)
+        load = Load(load.assumed_kg, assumed_kg=load.assumed_kg)
     elif width_kg <= KNOWN * most_kg:
         load = averaged(load, estimate_kg, width_kg, most_kg)
     return replace(belief, load=load, estimate_kg=estimate_kg, width_kg=width_kg, n_unweighed=0)
@@ -226,10 +226,8 @@ def read_lengths(
     """Return lengths (n,) [m], the last ones of lost readings; a mask (n,) of these; and the reason."""
     if readings is None:
         return last_m, np.ones(len(last_m), bool), "no readings within the tick"
-    reading = sensor.lengths(readings)
-    lost = reading.fault != SensorFault.OK.value
-    text = sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
-    return np.where(lost, last_m, reading.length_m), lost, text
+    length_m, lost = sensor.lengths(readings, last_m)
+    return length_m, lost, "; ".join(sensor.describe_lost(readings, lost))
 
 
 def on_reference(
