@@ -13,11 +13,9 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import ArmModel
-from mjx_softarm.sensing.estimator import SpringModel
-from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS
 from tests.arms import OTHER_ARMS
-from tests.linear_arm import even_estimator
+from tests.linear_arm import make_policy
 from tests.networks import s2r_of
 
 N_ARMS = 512  # in each call of `reset` and `step`: another number would compile anew
@@ -91,35 +89,24 @@ def make_arm_model():
     """Specification -> networks of a policy file, with random weights that change little."""
 
     def make(spec: ArmSpec, s2r: bool = False) -> ArmModel:
-        rng, n, n_sections = np.random.default_rng(3), spec.n_springs, spec.structure.n_sections
+        rng, policy = np.random.default_rng(3), make_policy(spec)
+        estimator, load, springs = policy.estimator, policy.load_estimator, policy.spring_model
+
+        def small(*shape):
+            return np.float32(0.01 * rng.normal(size=shape))
 
         def layers(*sizes):
-            pairs = itertools.pairwise(sizes)
-            return tuple(
-                (np.float32(0.01 * rng.normal(size=(a, b))), np.float32(0.01 * rng.normal(size=b)))
-                for a, b in pairs
-            )
+            return tuple((small(n_in, n_out), small(n_out)) for n_in, n_out in itertools.pairwise(sizes))
 
-        def row(value, size=n):
-            return np.full(size, value, np.float32)
-
-        angle = np.pi / 2 + 2 * np.pi * np.arange(n).reshape(n_sections, -1) / spec.springs_per_section
-        site_m = np.float32(0.067 * np.stack([np.cos(angle), np.sin(angle)], -1))
-        kg, estimator = np.float32([0.0, 1.0]), even_estimator(site_m)
-        coefficient = 1e-3 * rng.normal(size=estimator.coefficient.shape)
-        estimator = estimator._replace(coefficient=np.float32(coefficient))
-        scaling, kpa = (row(0.18), row(0.05)), (row(-10.0, spec.n_chambers), row(30.0, spec.n_chambers))
-        n_out, blocks = 2 * spec.n_chambers + n_sections, (n_sections, spec.n_chambers // n_sections)
-        plane = np.float32(0.1 * rng.normal(size=(n, n_out))), *scaling, row(-4.0, n_out), row(1.0, n_out)
-        known = np.float32(np.tile(np.eye(blocks[1]), (n_sections, 1, 1)))
-        hysteresis = row(0.7, spec.n_chambers), row(0.01, spec.n_chambers)
-        held = known, 0.1 * known, *hysteresis, *kg, np.float32(0.05)
-        load = LoadEstimator(layers(n, 4, n_out), *plane, *held)
-        springs = SpringModel(layers(spec.n_chambers, 5, n), *kpa, *scaling)
-        poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
-        n_in = N_POSE_INPUTS + n
-        network, anchors = layers(n_in, 6, N_POSE_OUTPUTS), np.float32(rng.normal(size=(4, n_in)))
-        s2r_network = s2r_of(network, 5.0, anchors=anchors, limit=np.float32(0.3))
-        return ArmModel(poses, estimator, load, springs, s2r_network if s2r else None)
+        n_in = N_POSE_INPUTS + spec.n_springs
+        network = layers(n_in, 6, N_POSE_OUTPUTS)
+        anchors = np.float32(rng.normal(size=(4, n_in)))
+        return ArmModel(
+            workspace=policy.workspace[:3],
+            estimator=estimator._replace(coefficient=0.1 * small(*estimator.coefficient.shape)),
+            load_estimator=load._replace(layers=layers(spec.n_springs, 4, len(load.out_scale))),
+            spring_model=springs._replace(layers=layers(spec.n_chambers, 5, spec.n_springs)),
+            s2r=s2r_of(network, 5.0, anchors=anchors, limit=np.float32(0.3)) if s2r else None,
+        )
 
     return make

@@ -19,7 +19,6 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.policy.lag import law_lag_s, middle_kpa, rest_rule, still
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.sensing.sensors import SensorFault
 from mjx_softarm.spec import ArmSpec
 
 POSE_COLUMNS = ("pressure_kpa", "tip_m", "tip_quaternion")  # needed in a log of poses
@@ -52,8 +51,7 @@ class StaticPoses(NamedTuple):
 
         A length stays NaN if any of a pose's readings is faulty.
         """
-        reading = spec.spring_sensor.lengths(self.readings)
-        length_m = np.where(reading.fault == SensorFault.OK, reading.length_m, np.nan)
+        length_m = spec.spring_sensor.lengths(self.readings, np.nan).length_m
         counted = np.arange(length_m.shape[1]) < self.n_rows[:, None]
         mean_m = np.sum(length_m, axis=1, where=counted[..., None]) / self.n_rows[:, None]
         return self._replace(spring_m=np.where(np.isnan(self.spring_m), mean_m, self.spring_m))

@@ -61,9 +61,8 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
     # Check the mark and the checksum before anything is unpacked.
     content, digest = data[:-_N_DIGEST], data[-_N_DIGEST:]
     if not content.endswith(_mark(kind)):
-        whole = zipfile.is_zipfile(io.BytesIO(data))
-        got = f"an archive without a {kind}'s mark at its end" if whole else "no complete npz archive"
-        raise SealedFileError(f"{path}: got {got}, {len(data)} bytes, expected {expected}")
+        got = f"{len(data)} bytes without a {kind}'s mark at their end"
+        raise SealedFileError(f"{path}: got {got}, expected {expected}")
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise SealedFileError(f"{path}: got {len(data)} bytes without their checksum, expected {expected}")
     # Unpack the arrays.
@@ -136,6 +135,19 @@ class Entries:
         if np.issubdtype(kind, np.floating) and not (held := np.abs(array) <= FLOAT32_MAX).all():
             self.fail(name, f"got {array[~held][0]}, expected finite numbers that float32 holds")
         return array if array.shape else array.item()
+
+    def one_of(self, name: str, choices: tuple[str, ...]) -> Any:
+        """Return a text that is one of the choices."""
+        text = self.take(name, np.str_, ())
+        if text not in choices:
+            self.fail(name, f"got {text}, expected {' or '.join(choices)}")
+        return text
+
+    def names(self, name: str, expected: tuple[str, ...]) -> None:
+        """Take a list of names, which has to be the expected one."""
+        names = self.take(name, np.str_, (None,)).tolist()
+        if names != list(expected):
+            self.fail(name, f"got {names}, expected {list(expected)}")
 
     def group(self, name: str, kind: type, *shapes: tuple[int, ...]) -> Any:
         """Return a dataclass or named tuple of numbers, each in one of the `shapes`."""

@@ -39,18 +39,14 @@ def main(
     arguments: Sequence[str] | None = None,
     finish: Callable[[str, Any], int] = lambda name, status: status,
 ) -> int:
-    """Run the command that the arguments begin with; list the commands where they stop short of one.
+    """Run the command that the arguments begin with, or list the commands; return the exit status.
 
     Args:
         prog: the program as its user calls it.
         about: a sentence about the program.
-        commands: functions by name, or texts MODULE:NAME, which are imported only when they run. The first
-            line of the docstring is the command's help.
+        commands: functions by name, or texts MODULE:NAME, which are imported only when they run.
         arguments: words of the command line, by default those of this process.
         finish: turns a command's name and its result into an exit status.
-
-    Returns:
-        The command's exit status, or one of `guarded`.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
 
@@ -137,13 +133,9 @@ def _line(command: Command) -> str:
 
 
 def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any]:
-    """Read the options of a command, and return the command with them, to be called.
+    """Read the options of a command, a function or a dataclass, and return it with them, to be called.
 
-    Args:
-        command: a function or a dataclass. A dataclass may have a classmethod `default`, which makes the
-            default options from the words of the command line.
-        prog: the command as its user calls it.
-        arguments: words of the command line after the command.
+    A dataclass may have a classmethod `default`, which makes the default options from the arguments.
 
     Raises:
         InputError: a dataclass refuses its values.

@@ -72,11 +72,9 @@ PositiveShare = Annotated[float, Rule(low=0.0, high=1.0, low_open=True)]
 
 
 def check_ranges(where: str, settings: Any) -> None:
-    """Raise InputError for a setting outside the range, or the names, of its type.
+    """Raise InputError for a setting outside the range, or the names, of its type; None has no range.
 
-    Args:
-        where: path or class of the settings with a dot at its end, or empty, for the message.
-        settings: dataclass whose fields have types such as `Count` or `Literal`; None has no range.
+    The message begins with `where`, the path or class of the settings with a dot at its end, or empty.
     """
     hints = typing.get_type_hints(type(settings), include_extras=True)
     for item in fields(settings):
@@ -181,11 +179,8 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
 def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -> None:
     """Raise SpecError for a list whose length is not the number of the arm's parts that it describes.
 
-    Args:
-        table: a dataclass whose fields have rules, or are such dataclasses.
-        counts: numbers of the arm's parts, such as chambers, by their names in rules.
-        source: file or code of the numbers, for the message.
-        prefix: name of the table in its source, with a dot at its end, or empty.
+    The fields of the dataclass `table` have rules, or are such dataclasses. `counts` are by the names that
+    rules have for parts. For the message there are source and prefix, the table's name with a dot or empty.
     """
     for item in fields(table):
         value, rule = getattr(table, item.name), rule_of(item)

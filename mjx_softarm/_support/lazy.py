@@ -22,11 +22,11 @@ __all__ = ["LazyModule", "brax_envs", "mjx", "mujoco", "put"]
 class LazyModule:
     """Stand-in for a module: the first attribute that is asked for imports it."""
 
-    def __init__(self, name: str, load: Callable[[str], Any] = importlib.import_module):
-        self._name, self._load = name, load
+    def __init__(self, name: str):
+        self._name = name
 
     def __getattr__(self, attribute: str) -> Any:
-        return getattr(self._load(self._name), attribute)
+        return getattr(_import_quietly(self._name), attribute)
 
 
 def _keep_bodies_apart() -> None:
@@ -63,8 +63,7 @@ if TYPE_CHECKING:
     from brax import envs as brax_envs
     from mujoco import mjx
 else:
-    mujoco, mjx = LazyModule("mujoco"), LazyModule("mujoco.mjx", _import_quietly)
-    brax_envs = LazyModule("brax.envs", _import_quietly)
+    mujoco, mjx, brax_envs = map(LazyModule, ("mujoco", "mujoco.mjx", "brax.envs"))
 
 
 def put(model: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:

@@ -65,6 +65,7 @@ def _eliminate(matrix: Array, columns: Array) -> Array:
     rows again for every other row.
     """
     n = len(matrix)
+    columns = jnp.broadcast_to(columns, (*columns.shape[:2], *matrix.shape[2:]))
     augmented = jax.lax.optimization_barrier(jnp.concatenate([matrix, columns], axis=1))
     for first in range(0, n, BLOCK):
         block = slice(first, min(first + BLOCK, n))

@@ -77,13 +77,13 @@ def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:
     return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
 
 
-def rows_last(function: Callable, n_at_once: int | None = None, n_shared: int = 0) -> Callable:
+def rows_last(function: Callable, n_at_once: int | None = None) -> Callable:
     """Return a function of one row; `jax.vmap` of it calls `function` with the rows as last axis.
 
     Args:
-        function: maps trees of arrays (..., *rows) to another; *rows may be empty.
+        function: maps trees of arrays (..., *rows) to another; *rows may be empty. Arrays of its last
+            argument have a last axis of 1 where all rows share them.
         n_at_once: rows of a chunk, one after another, the last filled up; None for all rows at once.
-        n_shared: number of last arguments whose arrays have a last axis of 1 where all rows share them.
     """
     one = jax.custom_batching.custom_vmap(function)
 
@@ -92,14 +92,13 @@ def rows_last(function: Callable, n_at_once: int | None = None, n_shared: int = 
         size = -(-n // n_chunks)
 
         def chunk(row: Any) -> Any:
-            def last(k: int, x: Any, is_batched: bool) -> jax.Array:
+            def last(x: Any, is_batched: bool) -> jax.Array:
                 x = jnp.asarray(x)
-                x = jnp.moveaxis(x[row], 0, -1) if is_batched else x[..., None]
-                return jnp.broadcast_to(x, (*x.shape[:-1], size)) if k < len(arguments) - n_shared else x
+                return jnp.moveaxis(x[row], 0, -1) if is_batched else x[..., None]
 
-            pairs = enumerate(zip(arguments, batched, strict=True))
-            rows = [jax.tree.map(functools.partial(last, k), *pair) for k, pair in pairs]
-            return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), function(*rows))
+            *each, shared = [jax.tree.map(last, *pair) for pair in zip(arguments, batched, strict=True)]
+            each = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], size)), each)
+            return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), function(*each, shared))
 
         if n_chunks == 1:
             results = chunk(slice(None))

@@ -24,7 +24,7 @@ from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.hysteresis import stop_after
 from mjx_softarm.sensing.load import KNOWN, Load, averaged, estimate_load, holds_payload
-from mjx_softarm.sensing.sensors import Sensor, SensorFault
+from mjx_softarm.sensing.sensors import Sensor
 
 STUCK_RANGE_M = 1e-5  # range of a stuck sensor over a window; a live one's noise is larger
 STUCK_PRESSURE_KPA = 2.0  # range of its chamber's pressure at which a live one moves; by hand
@@ -72,7 +72,7 @@ class Belief:
             spring_m=np.full(spec.n_springs, np.nan),
             n_lost=np.zeros(spec.n_springs, int),
             n_suspect=np.zeros(spec.n_chambers, int),
-            load=Load.assumed(spec.mass.payload_kg),
+            load=Load(spec.mass.payload_kg, assumed_kg=spec.mass.payload_kg),
             stop=np.zeros(spec.n_chambers),
         )
 
@@ -202,7 +202,7 @@ def _with_load(belief: Belief) -> Belief:
     mean_kpa = belief.window_chamber_kpa.mean(axis=0)
     estimate_kg, width_kg = map(float, estimate_load(model, belief.mean_m, mean_kpa, belief.stop))
     if not holds_payload(estimate_kg, width_kg, most_kg):
-        load = Load.assumed(load.assumed_kg)
+        load = Load(load.assumed_kg, assumed_kg=load.assumed_kg)
     elif width_kg <= KNOWN * most_kg:
         load = averaged(load, estimate_kg, width_kg, most_kg)
     return replace(belief, load=load, estimate_kg=estimate_kg, width_kg=width_kg, n_unweighed=0)
@@ -231,10 +231,8 @@ def read_lengths(
     """Return lengths (n,) [m], the last ones of lost readings; a mask (n,) of these; and the reason."""
     if readings is None:
         return last_m, np.ones(len(last_m), bool), "no readings within the tick"
-    reading = sensor.lengths(readings)
-    lost = reading.fault != SensorFault.OK.value
-    text = sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
-    return np.where(lost, last_m, reading.length_m), lost, text
+    length_m, lost = sensor.lengths(readings, last_m)
+    return length_m, lost, "; ".join(sensor.describe_lost(readings, lost))
 
 
 def on_reference(

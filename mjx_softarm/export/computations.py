@@ -23,7 +23,6 @@ from mjx_softarm.policy.lag import still
 from mjx_softarm.policy.reach import distances, followed
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import estimate_load
-from mjx_softarm.sensing.sensors import Reading, SensorFault
 from mjx_softarm.spec import ArmSpec
 
 
@@ -80,7 +79,7 @@ def answer(
         "reference_m": xp.where(acts, policy.sensor.lengths(reference).length_m, np.nan),
         "reference_reading": xp.where(acts, reference, np.nan),
         "length_m": reading.length_m,
-        "reading_lost": _lost(reading),
+        "reading_lost": reading.lost,
         "pose": pose,
         "extrapolation": away,
         "goal_outside": ~inside,
@@ -172,7 +171,7 @@ def _acting_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computat
     }
     acting = inputs.pose, inputs.goal, inputs.spring_m, *motion, inputs.load_kg
     return {
-        "lengths": _of(inputs.readings, inputs.spring_m, length_m=reading.length_m, lost=_lost(reading)),
+        "lengths": _of(inputs.readings, inputs.spring_m, length_m=reading.length_m, lost=reading.lost),
         "mean_length": _of(inputs.springs_m, mean_m=means[0]),
         "hysteresis": _of(inputs.stop, last_m, inputs.spring_m, next_stop=next_stop),
         "estimated_load": _of(
@@ -232,8 +231,3 @@ def _of(*inputs: Symbol, **outputs: Symbol) -> Computation:
 def _in_motion(spec: ArmSpec) -> InMotion:
     sizes = spec.n_springs, spec.n_springs, spec.n_chambers
     return InMotion(*(symbol(name, (n,)) for name, n in zip(InMotion._fields, sizes, strict=True)))
-
-
-def _lost(reading: Reading) -> Array:
-    """Return which readings (n_springs,) gave no length."""
-    return reading.fault != SensorFault.OK.value

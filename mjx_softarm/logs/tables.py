@@ -101,9 +101,7 @@ def _read_csv(path: Path) -> Table:
 def _check_text(path: Path, head: bytes) -> None:
     if not head.strip():
         raise _error(path, "got an empty file, expected a header and rows")
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")) or (
-        not head.startswith(b"PK") and 0.3 < head.count(0) / len(head) < 0.6 and head[:512].isascii()
-    ):
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise _error(path, "got UTF-16 text, expected UTF-8; save the file again with that encoding")
     if 0 in head:
         raise _error(path, "got a binary file, expected CSV text (or npz, by the end of its name)")

@@ -135,7 +135,7 @@ def settle_pressures(params: ArmParams, pressure_kpa: Array, n_at_once: int | No
 @functools.cache
 def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
     """Return `_solve` for one arm; `jax.vmap` of it puts the arms last, in chunks of `n_at_once`."""
-    return xla.rows_last(functools.partial(_solve, n_small), n_at_once, n_shared=1)
+    return xla.rows_last(functools.partial(_solve, n_small), n_at_once)
 
 
 def _solve(n_small: int, reference_m: Array, params: ArmParams) -> _Solution:

@@ -59,8 +59,8 @@ def law_lag_s(
         springs: from pressures (2, n_chambers, n_chambers) [kPa] to lengths (2, n_chambers, n_springs) [m].
         pressure_kpa (n_chambers,) [kPa]: pressures, around which G is taken, also beyond the limits.
     """
-    low, high = (np.broadcast_to(np.asarray(x, float), len(pressure_kpa)) for x in gains[4:6])
-    step_kpa = _STEP * (high - low)
+    range_kpa = np.asarray(gains.pressure_max_kpa, float) - np.asarray(gains.pressure_min_kpa, float)
+    step_kpa = np.broadcast_to(_STEP * range_kpa, len(pressure_kpa))
     either = pressure_kpa + np.stack([1.0, -1.0])[:, None, None] * np.diag(step_kpa)
     longer_m, shorter_m = springs(either)
     change = (longer_m - shorter_m).T / (2.0 * step_kpa)  # (n_springs, n_chambers) [m/kPa]

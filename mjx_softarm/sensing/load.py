@@ -85,11 +85,6 @@ class Load(NamedTuple):
     half_width_kg: float = 0.0  # half-width of the 95 % interval, the mean of the estimates' own
     assumed_kg: float = 0.0  # payload without any estimate, the specification's
 
-    @classmethod
-    def assumed(cls, kg: float) -> Load:
-        """Return the payload of an arm before any estimate, the specification's [kg]."""
-        return cls(kg, assumed_kg=kg)
-
     @property
     def believed_kg(self) -> float:
         """Payload [kg] that the pose is estimated with, never negative."""

@@ -123,14 +123,8 @@ def _normalised(s2r: S2R, x: Array) -> Array:
 
 
 def save_s2r(path: str | Path, s2r: S2R) -> None:
-    """Check a network and write it, whole or not at all. Equal networks give equal bytes.
-
-    Raises:
-        SealedFileError: the network is not valid, or the file cannot be written. An older file stays.
-    """
-    arrays = entries_of(KIND, s2r)
-    _unpack(arrays, str(path), len(s2r.input_low) - N_POSE_INPUTS)
-    write_sealed(Path(path), arrays, KIND)
+    """Write a network; raises as `write_sealed` does. Equal networks give equal bytes."""
+    write_sealed(Path(path), entries_of(KIND, s2r), KIND)
 
 
 def load_s2r(path: str | Path, n_springs: int) -> S2R:
@@ -139,13 +133,16 @@ def load_s2r(path: str | Path, n_springs: int) -> S2R:
     Raises:
         SealedFileError: the file is none of this kind, is damaged, or has a wrong entry.
     """
-    return _unpack(read_sealed(Path(path), KIND, "python -m calib run"), str(path), n_springs)
+    entries = Entries(read_sealed(Path(path), KIND, "python -m calib run"), str(path))
+    s2r = take_s2r(entries, n_springs)
+    entries.finish(1)
+    return s2r
 
 
 def take_s2r(entries: Entries, n_springs: int) -> S2R:
     """Take the network for an arm of n springs from the entries of a file."""
     n_in, n_out = N_POSE_INPUTS + n_springs, N_POSE_OUTPUTS
-    s2r = entries.network(
+    return entries.network(
         KIND,
         S2R,
         input_low=(n_in,),
@@ -157,19 +154,3 @@ def take_s2r(entries: Entries, n_springs: int) -> S2R:
         error_mm=(),
         layers=(n_in, n_out),
     )
-    for item, holds, expected in (
-        ("input_high", s2r.input_low < s2r.input_high, "more than input_low"),
-        ("output_high", s2r.output_low <= s2r.output_high, "at least output_low"),
-        ("limit", s2r.limit > 0.0, "a number > 0"),
-        ("error_mm", np.greater_equal(s2r.error_mm, 0.0), "a number >= 0"),
-    ):
-        if not np.all(holds):
-            entries.fail(f"{KIND}.{item}", f"got {getattr(s2r, item)}, expected {expected}")
-    return s2r
-
-
-def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int) -> S2R:
-    entries = Entries(arrays, source)
-    s2r = take_s2r(entries, n_springs)
-    entries.finish(1)
-    return s2r

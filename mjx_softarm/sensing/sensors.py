@@ -1,4 +1,4 @@
-"""Sensors of the springs: readings <-> calibrated lengths, believed range, and faults.
+"""Sensors of the springs: readings <-> calibrated lengths, and readings that are lost.
 
 A sensor is one class, whose fields are the section `[sensor]` of a specification, chosen by `kind`. Its
 methods `raw_length` and `raw_reading` map between readings and raw lengths l. All sensors share the
@@ -11,7 +11,6 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
@@ -23,22 +22,11 @@ from mjx_softarm._support.xp import Array, array_namespace
 MU_0_H_PER_M = 1.26e-6  # the paper's value of the vacuum permeability; beta absorbs the last digit
 
 
-class SensorFault(IntEnum):
-    """Reason why a reading gives no length."""
-
-    OK = 0
-    NOT_FINITE = 1  # NaN or infinite
-    TOO_LOW = 2  # below the believed range
-    TOO_HIGH = 3  # above the believed range
-    NO_COIL = 4  # at or above the resonance of the compensation alone: a shorted coil
-    NO_LENGTH = 5  # the calibration gives no positive length
-
-
 class Reading(NamedTuple):
-    """Lengths by the sensors, and the fault of each."""
+    """Lengths by the sensors, and which readings gave none."""
 
     length_m: Array  # (..., n), always finite
-    fault: Array  # (..., n) int32, a `SensorFault`
+    lost: Array  # (..., n) bool
 
 
 @dataclass(frozen=True)
@@ -89,28 +77,18 @@ class Sensor:
     def lengths(self, readings: Array, fallback_m: Array = 0.0) -> Reading:
         """Return the calibrated spring lengths of readings (..., n) [unit], which may be any numbers.
 
-        A reading that gives no length is reported in `fault`: its length is `fallback_m`, () or (..., n) [m],
-        and no gradient flows through it. A control loop passes the last good lengths, so that one lost
-        reading holds the arm for a tick.
+        A reading is lost that is not believed, or that gives no length > 0. Its length is `fallback_m`, () or
+        (..., n) [m], and no gradient flows through it. A control loop passes the last good lengths, so that
+        one lost reading holds the arm for a tick.
         """
-        # Lengths; readings that are not believed are replaced, so that no NaN arises on their way
+        # Readings that are not believed are replaced, so that no NaN arises on their way.
         xp = array_namespace(readings, fallback_m, *vars(self).values())
         low, high = self.range
         believed = (readings >= low) & (readings <= high)
         raw_m, exists = self.raw_length(xp.where(believed, readings, low))
         length_m = self.beta * raw_m + self.delta_m
-
-        # Faults; a later one overrules an earlier one
-        fault = xp.zeros(length_m.shape, xp.int32)
-        for bad, code in (
-            (length_m <= 0.0, SensorFault.NO_LENGTH),
-            (~exists, SensorFault.NO_COIL),
-            (readings > high, SensorFault.TOO_HIGH),
-            (readings < low, SensorFault.TOO_LOW),
-            (~xp.isfinite(readings), SensorFault.NOT_FINITE),
-        ):
-            fault = xp.where(bad, int(code), fault)
-        return Reading(xp.where(fault == SensorFault.OK.value, length_m, fallback_m), fault)
+        lost = ~(believed & exists & (length_m > 0.0))
+        return Reading(xp.where(lost, fallback_m, length_m), lost)
 
     def readings(self, length_m: Array) -> Array:
         """Return the readings (..., n) [unit] of calibrated lengths (..., n) [m]; NaN where there is none."""
@@ -118,21 +96,22 @@ class Sensor:
         readings, exists = self.raw_reading((length_m - self.delta_m) / self.beta)
         return xp.where(exists, readings, math.nan)
 
-    def describe_faults(self, readings: Array, fault: Array) -> str:
-        """Return a line for each faulty spring of one arm, from readings and faults (n,) of `lengths`."""
-        lines = []
-        for index in np.flatnonzero(np.asarray(fault) != SensorFault.OK):
-            each = {name: np.broadcast_to(value, np.shape(fault)) for name, value in vars(self).items()}
+    def describe_lost(self, readings: np.ndarray, lost: np.ndarray) -> list[str]:
+        """Return a sentence for each lost reading of one arm, both (n,) as of `lengths`."""
+        sentences = []
+        for index in np.flatnonzero(lost):
+            each = {name: np.broadcast_to(value, np.shape(lost)) for name, value in vars(self).items()}
             one = type(self)(**{name: float(value[index]) for name, value in each.items()})
-            expected = one.expected(SensorFault(int(fault[index])))
-            lines.append(f"spring{index}: got {float(readings[index]):.7g} {self.unit}, expected {expected}")
-        return "\n".join(lines)
+            reading = float(readings[index])
+            expected = one.expected(reading)
+            sentences.append(f"spring{index}: got {reading:.7g} {self.unit}, expected {expected}")
+        return sentences
 
-    def expected(self, fault: SensorFault) -> str:
-        """Return the reading expected in place of a faulty one, in words, for the sensor of one spring."""
-        if fault == SensorFault.NO_LENGTH:
-            return f"a length > 0 m after beta = {self.beta:g} and delta = {self.delta_m:g} m"
+    def expected(self, reading: float) -> str:
+        """Return what is expected in place of a lost reading, in words, for the sensor of one spring."""
         low, high = self.range
+        if low <= reading <= high:
+            return f"a length > 0 m after beta = {self.beta:g} and delta = {self.delta_m:g} m"
         return f"{low:g} to {high:g} {self.unit}"
 
 
@@ -192,9 +171,10 @@ class Coil(Sensor):
         inverse_h = xp.where(exists, raw_m, 1.0) / xp.where(exists, total_hm, 1.0)
         return xp.sqrt(inverse_h / self.capacitance_f) / (2.0 * math.pi), exists
 
-    def expected(self, fault: SensorFault) -> str:
-        if fault != SensorFault.NO_COIL:
-            return super().expected(fault)
+    def expected(self, reading: float) -> str:
+        low, high = self.range
+        if not low <= reading <= high or self.raw_length(reading)[1]:
+            return super().expected(reading)
         limit_hz = 0.5 / math.pi / math.sqrt(self.capacitance_f * self.compensation_h)
         return f"below {limit_hz:.7g} Hz, where the compensation resonates without the coil"
 

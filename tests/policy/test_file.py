@@ -113,11 +113,10 @@ def test_files_that_are_no_policy(tmp_path):
     path = tmp_path / "other.npz"
     assert refusal(path) == "got 'No such file or directory', expected a file of `python -m train export`"
     expected = "expected an unchanged file of `python -m train export`"
-    for content in (b"", b"name = 'paper'\n", b"PK\x03\x04", bytes(1000)):
+    for content in (b"", b"name = 'paper'\n", b"PK\x03\x04", sealed({"weight": np.zeros(3)}, "s2r")):
         path.write_bytes(content)
-        assert refusal(path) == f"got no complete npz archive, {len(content)} bytes, {expected}"
-    np.savez(path, weight=np.zeros(3))
-    assert refusal(path).startswith("got an archive without a policy's mark at its end")
+        got = f"got {len(content)} bytes without a policy's mark at their end"
+        assert refusal(path) == f"{got}, {expected}"
 
 
 def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file, monkeypatch):
@@ -147,10 +146,6 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ("observation", "force", "observation: got force, expected pose or payload or motion"),
         ("observation", "payload", "obs_layout: got ['pose_x_mm', "),
         ("action_layout", ["voltage0"] * 9, "action_layout: got ['voltage0', 'voltage0', "),
-        ("obs_scale.scale", np.zeros(6), "obs_scale.scale: got [0.0, "),
-        ("action.low", np.full(9, 5e6), "action.low: got [5000000.0, "),
-        ("gains.pressure_min_kpa", 20.0, "gains.pressure_min_kpa: got 20.0, expected less than"),
-        ("rate_hz", 0.0, "rate_hz: got 0.0, expected a number > 0"),
         ("s2r_kind", "none", "s2r.0.bias: got an unknown entry, expected those of schema 17"),
         ("workspace", np.zeros((0, 6), np.float32), "workspace: got float32 (0, 6), expected "),
         ("spring_model.spring_scale_m", np.zeros(9, np.float32), "spring_model.spring_scale_m: got [0.0"),
@@ -162,15 +157,6 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
 def test_entries_that_do_not_fit(file, entry, value, message):
     file.write_bytes(sealed(arrays_of(file) | {entry: np.array(value)}, export.KIND))
     assert refusal(file).startswith(message)
-
-
-def test_policy_that_is_not_finite_is_not_written(file, make_policy):
-    before = file.read_bytes()
-    layers = make_policy().layers
-    layers[0][0][3, 2] = np.nan
-    with pytest.raises(SealedFileError, match=r"actor\.0\.weight: got nan, expected finite numbers"):
-        save_policy(file, make_policy(layers=layers))
-    assert file.read_bytes() == before
 
 
 def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, monkeypatch):

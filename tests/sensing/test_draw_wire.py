@@ -17,7 +17,6 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.policy.file import load_policy, save_policy
-from mjx_softarm.sensing.sensors import SensorFault
 from tests.linear_arm import GOALS, LinearArm, exact_plan, go, make_policy
 
 WIRE = {"kind": "draw_wire", "m_per_v": 0.2, "voltage_min_v": 0.05, "voltage_max_v": 4.95}
@@ -38,14 +37,14 @@ class WireArm(LinearArm):
 
 def test_voltages_are_lengths_by_scale_and_calibration():
     volts = np.array([0.5, 1.0, 1.5, 2.0, 0.04, 5.0, np.nan, 2.0, 2.0])
-    length_m, fault = PLANTED.lengths(volts, 0.1)
-    short, *bad = [SensorFault.NO_LENGTH, SensorFault.TOO_LOW, SensorFault.TOO_HIGH, SensorFault.NOT_FINITE]
-    np.testing.assert_array_equal(fault, [short, 0, 0, 0, *bad, 0, 0])
-    np.testing.assert_allclose(length_m[4:7], 0.1)
-    good = fault == 0
+    length_m, lost = PLANTED.lengths(volts, 0.1)
+    good = ~lost
+    # The lost ones are too short by the calibration, too low, too high, and not a number.
+    np.testing.assert_array_equal(good, [0, 1, 1, 1, 0, 0, 0, 1, 1])
+    np.testing.assert_allclose(length_m[lost], 0.1)
     np.testing.assert_allclose(length_m[good], (BETA * volts / 5.0 * 1.0 + DELTA_M)[good])
     np.testing.assert_allclose(PLANTED.readings(length_m)[good], volts[good])
-    assert "spring4: got 0.04 V, expected 0.05 to 4.95 V" in PLANTED.describe_faults(volts, fault)
+    assert "spring4: got 0.04 V, expected 0.05 to 4.95 V" in PLANTED.describe_lost(volts, lost)
 
 
 def test_actions_are_voltages_and_lead_where_they_say(quick_compiler):

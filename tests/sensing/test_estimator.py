@@ -40,10 +40,10 @@ def integrated(length_m, towards_rad, bend_rad, n=20_000):
     return middle.apply([0, 0, -length_m]).mean(axis=0), Rotation.from_rotvec(bend_rad * axis).as_matrix()
 
 
-def random_estimator(seed, size=1.0, dtype=np.float32):
+def random_estimator(seed, dtype=np.float32):
     """An estimator with random polynomials, of variables beyond their range as well as in it."""
     even, rng = even_estimator(SITE_M), np.random.default_rng(seed)
-    coefficient = size * rng.normal(size=even.coefficient.shape) * np.repeat([1e-4, 5e-4], 3)
+    coefficient = rng.normal(size=even.coefficient.shape) * np.repeat([1e-4, 5e-4], 3)
     centre, scale = np.zeros(N_VARIABLES), np.ones(N_VARIABLES)
     centre[0], scale[:3] = 0.2, [0.03, 0.5, 0.5]
     each = {"variable_centre": np.tile(centre, (3, 1)), "variable_scale": np.tile(scale, (3, 1))}
@@ -138,18 +138,6 @@ def test_straight_arm_has_a_slope():
     ahead, back = (estimate_frame(double, STRAIGHT_M + sign * step, 0.0).position_m for sign in (1, -1))
     np.testing.assert_allclose(slope, (ahead - back).T / 2e-4, atol=2e-2)
     assert np.abs(slope).max() > 0.5
-
-
-def test_nothing_jumps_through_gimbal_lock():
-    """The tip's x axis swept through the vertical: yaw and roll jump by 180 degrees, the frame does not."""
-    share = np.linspace(0.9, 1.1, 400)[:, None]
-    bent = np.concatenate([springs_of(0.2, 0.0, np.pi / 6)] * 3)
-    spring_m = (0.2 + share * (bent - 0.2)).astype(np.float32)
-    estimator = random_estimator(3, size=0.1)
-    assert np.abs(estimate(estimator, spring_m, 0.0)[:, 4]).max() > 85.0
-    frame = estimate_frame(estimator, spring_m, 0.0)
-    assert np.abs(np.diff(frame.rotation, axis=0)).max() < 2e-3
-    assert np.abs(np.diff(frame.position_m, axis=0)).max() < 1e-3
 
 
 @pytest.mark.parametrize("n_chambers", [9, 18])

@@ -34,13 +34,6 @@ def estimator_of(rng):
     return LoadEstimator(*jax.tree.map(np.float32, numbers))
 
 
-def after(*estimate_kg, width_kg=0.1):
-    load = Load(0.0)
-    for kg in estimate_kg:
-        load = averaged(load, kg, width_kg, 1.0)
-    return load
-
-
 def test_estimate_is_generalised_least_squares_with_all_covariances():
     rng = np.random.default_rng(2)
     estimator, spring_m = estimator_of(rng), rng.uniform(0.15, 0.25, (4, N))
@@ -79,31 +72,29 @@ def test_numpy_and_jax_agree():
     np.testing.assert_allclose(estimate_load(estimator, *rows), in_jax, rtol=1e-4, atol=1e-5)
 
 
-def test_rests_are_averaged():
-    assert after(0.4, 0.5, 0.7, 0.6).kg == pytest.approx(0.55)
-    late = after(*[0.5] * 100, 0.6)
-    assert late.kg == pytest.approx(0.5 + 0.1 / N_AVERAGED) and late.n_estimates == N_AVERAGED
-
-
-@pytest.mark.parametrize("change_kg", [-2 * JUMP, 2 * JUMP])
-def test_two_rests_that_disagree_begin_a_new_average(change_kg):
-    held = after(0.6, 0.6, 0.6)
-    once = averaged(held, 0.6 + change_kg, 0.2, 1.0)
-    assert once.kg == held.kg and not once.began
-    again = averaged(once, 0.65 + change_kg, 0.2, 1.0)
-    assert again == Load(0.65 + change_kg, 1, began=True, half_width_kg=0.2)
-    assert not averaged(again, 0.65 + change_kg, 0.2, 1.0).began
+@pytest.mark.parametrize(
+    ("rests_kg", "kg", "n_estimates", "began"),
+    [
+        ([0.4, 0.5, 0.7, 0.6], 0.55, 4, False),
+        ([*[0.5] * 100, 0.6], 0.5 + 0.1 / N_AVERAGED, N_AVERAGED, False),
+        ([0.6, 0.6, 0.0, 0.6, 0.0], 0.6, 3, False),  # an odd one is forgotten
+        ([0.6, 0.6, 0.6, 0.6 + 2 * JUMP, 0.65 + 2 * JUMP], 0.65 + 2 * JUMP, 1, True),  # two are not
+        ([0.6, 0.6, 0.6, 0.6 - 2 * JUMP, 0.65 - 2 * JUMP], 0.65 - 2 * JUMP, 1, True),
+        ([0.0, 0.6, 0.7, 0.7], 0.7, 2, False),
+    ],
+)
+def test_rests_are_averaged_until_two_in_a_row_disagree(rests_kg, kg, n_estimates, began):
+    load = Load(0.0)
+    for rest_kg in rests_kg:
+        load = averaged(load, rest_kg, 0.1, 1.0)
+    assert load.kg == pytest.approx(kg) and (load.n_estimates, load.began) == (n_estimates, began)
+    assert load.half_width_kg == pytest.approx(0.1)
 
 
 def test_rests_whose_intervals_meet_do_not_disagree():
     wide = averaged(Load(0.0), 1.0, 0.2, 1.0)
     for kg, begins in ((0.65, False), (0.55, True)):
         assert averaged(averaged(wide, kg, 0.2, 1.0), kg, 0.2, 1.0).began is begins
-
-
-def test_one_odd_rest_is_forgotten():
-    load = after(0.6, 0.6, 0.0, 0.6, 0.0)
-    assert load.kg == pytest.approx(0.6) and not load.began
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def advance(
     n_ticks, n_steps = round(duration_s / period_s), math.ceil(period_s / step_s - 1e-9)
     tick = functools.partial(_tick, arm, n_steps, period_s)
     forward, back = (
-        xla.rows_last(function, n_at_once, n_shared=1)
+        xla.rows_last(function, n_at_once)
         for function in (functools.partial(_run, tick, n_ticks), functools.partial(_run_back, tick))
     )
     run = jax.custom_vjp(lambda start, constants: forward(start, constants)[0])
