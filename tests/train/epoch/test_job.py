@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
@@ -15,7 +14,6 @@ from tests.arms import SHORT
 from tests.train.small import CONFIG, new_job
 from train.epoch.job import FreshPoses
 from train.runs import run
-from train.runs.folder import Run
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -114,16 +112,6 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
     assert np.isfinite(state.arms.pipeline_state.chamber_stiffness).all()
 
 
-def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tmp_path):
-    checkpoints, state = Run.create(tmp_path, CONFIG, CalibratedArm(job.env.spec)).checkpoints, start(job)
-    with pytest.raises(InputError, match="got no checkpoint"):
-        checkpoints.restore(state)
-    checkpoints.save(0, state, job.learner.parts(state.learner))
-    for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
-        with pytest.raises(InputError, match=f"{tmp_path}/.*: got .* of other parts or sizes"):
-            checkpoints.restore(other)
-
-
 POSES = EnvConfig(n_poses=32, even_share=0.5)
 
 
@@ -144,12 +132,6 @@ def test_a_pool_serves_some_epochs_and_each_run_has_its_own(pools):
     np.testing.assert_array_equal(poses[4], pools()(4).pose)  # of a run that goes on
     lasting = pools(every=0)
     assert lasting(0) is lasting(5)
-
-
-def test_success_is_of_episodes_or_of_single_actions():
-    episodes = {"env/episodes": 8.0, "env/successes": 6.0}
-    for row, text in ((episodes, "exploring: success 75 % of episodes"), ({}, "success 50 % of actions")):
-        assert run._success([row | {"env/reached": 0.5}] * 2) == text
 
 
 def test_an_epoch_in_which_most_arms_in_motion_diverge_ends_the_run_and_names_the_step():
