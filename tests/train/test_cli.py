@@ -14,6 +14,7 @@ import pytest
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
@@ -21,7 +22,7 @@ from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from tests.arms import SHORT
-from tests.train.small import CONFIG, distil_little, flags, new_job
+from tests.train.small import CONFIG, flags, new_job
 from train.__main__ import main
 from train.runs.folder import Run, sole_trainer
 
@@ -110,8 +111,9 @@ def test_an_evaluation_with_a_payload_is_of_an_arm_that_carries_it(whole, monkey
 def test_an_exported_policy_asks_for_the_same_lengths_on_a_later_calibration(
     whole, tmp_path, monkeypatch, capsys
 ):
-    distil_little(monkeypatch)
-    monkeypatch.setattr("train.runs.arm_model.N_WORKSPACE", 256)
+    few = {"N_TRAINING": 512, "N_JUDGING": 256, "N_HELD_OUT": 64, "N_WORKSPACE": 256, "PAYLOADS": (0.0,)}
+    for name, value in {**few, "SCHEDULE": Schedule(10, 4e-3, 256)}.items():
+        monkeypatch.setattr(f"train.runs.arm_model.{name}", value)
     assert main(["export", str(whole)]) == 0
 
     # Later, the springs' zeros have shifted, and the arm was seen at other lengths

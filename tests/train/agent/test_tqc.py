@@ -142,7 +142,8 @@ def test_update_is_one_adam_step_on_each_loss_at_the_incoming_state(agent, state
     def actor_objective(params):
         action, log_prob = squash(*agent.actor.apply(params, batch.obs), noise)
         quantiles = agent.critics.apply(state.critic_params, batch.obs, action)
-        return tqc.actor_loss(log_prob, quantiles, alpha), jnp.mean(log_prob)
+        loss = jnp.mean(alpha * log_prob - jnp.mean(quantiles, axis=(1, 2)))
+        return loss, jnp.mean(log_prob)
 
     loss_critic, d_critic = jax.jit(jax.value_and_grad(critic_objective))(state.critic_params)
     actor_grad = jax.jit(jax.value_and_grad(actor_objective, has_aux=True))

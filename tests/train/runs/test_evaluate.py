@@ -173,26 +173,13 @@ def test_figures_of_a_motion():
     assert len(figures.rows()) == 2 + len(at_rest.rows())
 
 
-@pytest.fixture
-def perfect(short_env, shown):
-    """A learner whose policy knows every answer; `policy` is the error [mm] below which it turns away."""
-
-    class Perfect:
-        def mode(self, policy, obs):
-            goal = obs[6:12] * short_env.scale.scale + short_env.scale.centre
-            nearest = jnp.argmin(jnp.sum((jnp.asarray(shown.positions) - goal) ** 2, axis=-1))
-            answer, off_mm = jnp.asarray(shown.actions)[nearest], jnp.linalg.norm(obs[12:15]) / 0.0056
-            return jnp.where(off_mm < policy, -answer, answer)
-
-    return Perfect()
-
-
 @pytest.mark.parametrize("pipe_mm", [None, 130.0], ids=["open", "narrower than the arm"])
-def test_positions_are_evaluated_with_body_and_pressures(short_env, perfect, shown, pipe_mm):
+def test_positions_are_evaluated_with_body_and_pressures(short_env, shown, pipe_mm):
     n = len(shown.positions)
     piped = ReachEnv(short_env.spec, dataclasses.replace(short_env.config, pipe_diameter_mm=pipe_mm))
     positions, first = np.asarray(shown.positions), np.arange(n) % 2 == 0
-    figures, at = PositionEvaluator(piped, perfect, positions=positions, first=first)(0.0)
+    knowing = Scripted(short_env, jnp.asarray(positions))
+    figures, at = PositionEvaluator(piped, knowing, positions=positions, first=first)(shown.actions)
     assert figures.reached_share == 1.0 and figures.max_mm < 0.05 and len(figures.error_mm) == n
     assert (
         figures.success_share == (pipe_mm is None) and figures.outside_positions == (pipe_mm is not None) * n
