@@ -151,11 +151,6 @@ class ImitationConfig(TQCConfig):
         return tuple(round(share * self.n_epochs) for share in shares)
 
     @property
-    def milestones(self) -> tuple[int, ...]:
-        """Numbers of epochs at the ends of the stages."""
-        return self.stage_epochs
-
-    @property
     def rebalance_epochs(self) -> int:
         """Number of epochs between two shifts of the goals; 0 is never."""
         return -(-self.rebalance_env_steps // (self.n_arms * self.vector_steps_per_epoch))
