@@ -30,12 +30,12 @@ from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from train.config import TrainConfig, override
-from train.epoch.job import Epoch, Job, State
+from train.epoch.job import Epoch, FreshPoses, Job, State
 from train.options import start
 from train.runs.command import ReachOptions
 from train.runs.evaluate import Summary
 from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
-from train.runs.run import Interrupted, free_path, fresh_poses, task_of, train_together
+from train.runs.run import Interrupted, free_path, task_of, train_together
 
 RESULTS_FILE = "results.json"
 
@@ -198,7 +198,7 @@ def train(path: Path, runs: Sequence[Run], console: Console) -> None:
     console.print("drawing goals from the reachable workspace ...")
     configs = [run.config for run in runs]
     env = ReachEnv(runs[0].spec, configs[0].env, runs[0].arm.s2r)
-    job = Job(MembersEpoch(configs[0], env), fresh_poses(configs[0], env))
+    job = Job(MembersEpoch(configs[0], env), FreshPoses(env, configs[0]))
     keys = jnp.stack([jax.random.PRNGKey(config.seed) for config in configs])
     numbers = {name: jnp.asarray(x, jnp.float32) for name, x in differing(runs).items()}
     tasks = {config.env: task_of(config, with_config(env, config)) for config in configs}

@@ -193,7 +193,8 @@ class Imitation:
         key_between, key_update = jax.random.split(key)
         discriminator, metrics, stored = state.discriminator, {}, batch.stored
         assert stored is not None  # the epoch gives it
-        index = self._index_of(stored.goal)  # (B,) demonstrated positions that are the goals
+        away = jnp.sum((stored.goal[:, None] - self.positions) ** 2, axis=-1)  # (B, m)
+        index = jnp.argmin(away, axis=-1)  # (B,) demonstrated positions that are the goals
 
         # Batch: the first rows are exchanged for the expert's.
         batch = self.with_expert(batch, index)
@@ -277,10 +278,6 @@ class Imitation:
         return batch._replace(
             **{name: jnp.concatenate([rows, getattr(batch, name)[n:]]) for name, rows in expert.items()}
         )
-
-    def _index_of(self, goal: Array) -> Array:
-        """Return the indices (...) of the demonstrated positions that are the goals (..., 6)."""
-        return jnp.argmin(jnp.sum((goal[..., None, :] - self.positions) ** 2, axis=-1), axis=-1)
 
 
 class DemonstratedGoals:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import jax
 from jax import Array
@@ -13,6 +13,9 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.reach import POOL_SEED
 from mjx_softarm.mechanics.workspace import Pool
+
+if TYPE_CHECKING:
+    from train.config import TrainConfig
 
 T = TypeVar("T")
 State = Any  # `ReplayState`, or `GradientState` of the learner `analytic`
@@ -95,12 +98,13 @@ class FreshPoses:
 
     A policy that is trained for long on one pool learns the pool by heart: after 41,000 gradient steps,
     `analytic` had 0.62 mm at the 16,384 poses of its pool and 0.79 mm at others. A thread draws the next pool
-    while the epochs of this one run. With `every` = 0, the environment's own pool serves all epochs.
+    while the epochs of this one run. Without `fresh_poses_epochs`, the environment's own pool serves all.
     """
 
-    def __init__(self, env: ReachEnv, every: int, n_epochs: int, seed: int):
-        self._pool, self._every, self._n_pools = env.poses, every, -(-n_epochs // every) if every else 1
-        self._seeds, self._thread = (POOL_SEED, seed), ThreadPoolExecutor(1)
+    def __init__(self, env: ReachEnv, config: TrainConfig):
+        self._pool, self._every = env.poses, config.fresh_poses_epochs
+        self._n_pools = -(-config.learner.n_epochs // self._every) if self._every else 1
+        self._seeds, self._thread = (POOL_SEED, config.seed), ThreadPoolExecutor(1)
         self._futures: dict[int, Future[Pool]] = {}  # by number of the pool
 
     def __call__(self, epoch: int) -> Pool:

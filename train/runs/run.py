@@ -50,7 +50,7 @@ def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations |
     """
     epoch: Any = config.learner.make_epoch(env, demonstrations)
     if demonstrations is None:
-        job = Job(epoch, fresh_poses(config, env))
+        job = Job(epoch, FreshPoses(env, config))
         return Task(job, Evaluator(env, epoch.learner), lambda state, k: state)
     positions, first = demonstrations.positions, epoch.goals.of_stage(0)
     evaluate = PositionEvaluator(env, epoch.learner, positions=positions, first=first)
@@ -71,11 +71,6 @@ def task_of_run(run: Run) -> Task:
         InputError: its demonstrations cannot be read.
     """
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations())
-
-
-def fresh_poses(config: TrainConfig, env: ReachEnv) -> FreshPoses:
-    """Return the pools of poses of a run."""
-    return FreshPoses(env, config.fresh_poses_epochs, config.learner.n_epochs, config.seed)
 
 
 class Interrupted(Exception):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.agent.gail import Gail, GailConfig, cross_entropy, gradient_penalty, learned_reward
+from train.agent.gail import Gail, GailConfig, gradient_penalty
 from train.agent.learner import Transition
 from train.agent.tqc import TQC, TQCConfig
 
@@ -13,25 +13,9 @@ RNG = np.random.default_rng(0)
 OBS, ACTION = RNG.normal(size=(64, 5)), RNG.normal(size=(64, 3))
 
 
-def test_cross_entropy_is_that_of_probabilities():
-    expert, agent = RNG.normal(size=40), RNG.normal(size=40)
-    of_expert = [1.0 / (1.0 + np.exp(-h)) for h in (expert, agent)]
-    expected = -np.mean(np.log(of_expert[0])) - np.mean(np.log(1.0 - of_expert[1]))
-    np.testing.assert_allclose(cross_entropy(jnp.array(expert), jnp.array(agent)), expected, rtol=1e-5)
-
-
-def test_reward_is_the_papers_log_of_one_minus_the_probability_of_the_agent_and_finite_far_out():
-    logits = np.array([-3.0, -0.2, 0.0, 2.0])
-    expected = np.log(1.0 - 1.0 / (1.0 + np.exp(logits)))
-    np.testing.assert_allclose(learned_reward(jnp.array(logits)), expected, rtol=1e-5)
-    far = learned_reward(jnp.array([-1e4, -100.0, 100.0, 1e4]))
-    np.testing.assert_allclose(far, [-1e4, -100.0, 0.0, 0.0], atol=1e-6)
-    assert (far <= 0.0).all()
-
-
 @pytest.mark.parametrize("penalty_on", ["logit", "probability"])
-def test_the_penalty_is_on_the_logit_or_as_printed_on_the_probability(penalty_on):
-    """The probability's slope is D (1 - D) times the logit's."""
+def test_losses_and_reward_are_the_paper_s_with_a_penalty_on_the_logit_or_on_the_probability(penalty_on):
+    """The probability's slope is D (1 - D) times the logit's; the reward is log(1 - D) of the agent's D."""
     gail = Gail(5, 3, GailConfig(hidden=(8,), input_scale=1.0, penalty_on=penalty_on))
     state, (obs, action) = gail.init(jax.random.PRNGKey(0)), (jnp.array(OBS), jnp.array(ACTION))
     pair = (obs, action), (obs, action)  # all points between the two are the pair itself
@@ -39,10 +23,14 @@ def test_the_penalty_is_on_the_logit_or_as_printed_on_the_probability(penalty_on
     logit = lambda x: gail.network.apply(state.params, x[:5], x[5:])  # noqa: E731
     rows = jnp.concatenate([obs, action], axis=-1)
     slope = np.linalg.norm(jax.vmap(jax.grad(logit))(rows), axis=-1)
+    probability = 1.0 / (1.0 + np.exp(-jax.vmap(logit)(rows)))  # of the expert
     if penalty_on == "probability":
-        probability = 1.0 / (1.0 + np.exp(-jax.vmap(logit)(rows)))
         slope = slope * probability * (1.0 - probability)
     np.testing.assert_allclose(metrics["gradient_penalty"], np.mean((slope - 1.0) ** 2), rtol=1e-4)
+    entropy = -np.mean(np.log(probability)) - np.mean(np.log(1.0 - probability))
+    np.testing.assert_allclose(metrics["discriminator_loss"], entropy, rtol=1e-4)
+    of_agent = 1.0 - probability
+    np.testing.assert_allclose(gail.reward(state.params, obs, action), np.log(1.0 - of_agent), rtol=1e-4)
 
 
 def test_penalty_and_its_slope_are_finite_where_the_discriminator_is_flat():

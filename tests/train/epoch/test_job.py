@@ -112,14 +112,12 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
     assert np.isfinite(state.arms.pipeline_state.chamber_stiffness).all()
 
 
-POSES = EnvConfig(n_poses=32, even_share=0.5)
-
-
 @pytest.fixture(scope="module")
 def pools():
-    """Arguments -> pools of a run of six epochs, each for two of them."""
-    env = ReachEnv(SHORT, POSES)
-    return lambda every=2, seed=0: FreshPoses(env, every, 6, seed)
+    """Settings -> pools of a run, each for two of its epochs by default."""
+    env = ReachEnv(SHORT, EnvConfig(n_poses=32, even_share=0.5))
+    config = lambda every, seed: dataclasses.replace(CONFIG, fresh_poses_epochs=every, seed=seed)  # noqa: E731
+    return lambda every=2, seed=0: FreshPoses(env, config(every, seed))
 
 
 def test_a_pool_serves_some_epochs_and_each_run_has_its_own(pools):
