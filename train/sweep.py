@@ -85,15 +85,9 @@ def variable(config: TrainConfig) -> tuple[str, ...]:
 
 
 def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -> dict[str, TrainConfig]:
-    """Return the members of a sweep, each seed with each combination of the varied numbers.
+    """Return the configs of a sweep's members by names such as `seed0-learner.gamma=0.5`.
 
-    Args:
-        config: settings that the members share.
-        seeds: seeds.
-        vary: NAME=VALUE,VALUE,... for each varied number.
-
-    Returns:
-        Configs by names such as `seed0-learner.gamma=0.5`.
+    Each seed comes with each combination of the varied numbers, each a NAME=VALUE,VALUE,... of `vary`.
 
     Raises:
         InputError: a setting is unknown or no number, or a value cannot be used or comes twice.

@@ -40,11 +40,6 @@ class Task(NamedTuple):
 def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations | None = None) -> Task:
     """Return the task of a run: to reach the whole workspace, or positions as an expert showed.
 
-    Args:
-        config: settings of the run.
-        env: environment of its arms.
-        demonstrations: demonstrations to learn from, for a learner from demonstrations.
-
     Raises:
         InputError: the learner needs demonstrations and has none.
     """
@@ -78,10 +73,7 @@ class Interrupted(Exception):
 
 
 def train(run: Run, task: Task, console: Console) -> Any:
-    """Train to the end of the run's config, from its newest checkpoint if it has one.
-
-    Returns:
-        Figures of the final policy.
+    """Train to the end of the run's config, from its newest checkpoint if it has one; return final figures.
 
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
@@ -115,19 +107,10 @@ def train_together(
     console: Console,
     member: Callable[[State, int], State] = lambda state, k: state,
 ) -> list[Any]:
-    """Train all members of one job to their end: a single run, or the runs of a sweep.
+    """Train all members of one job, a run or the runs of a sweep, to their end; return their final figures.
 
-    Args:
-        job: job of the run, or of the sweep.
-        members: runs with their tasks.
-        begin: deletes what is later than the state to begin with; returns the number of epochs done, and the
-            state after them.
-        path: folder that `--resume` continues.
-        console: shows progress.
-        member: takes the state of the k-th member from the job's.
-
-    Returns:
-        Figures of each member's final policy.
+    `begin` deletes what is later than the state to begin with, and returns the number of epochs done and this
+    state. `member` takes the state of the k-th member from the job's. `--resume` continues the folder `path`.
 
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
@@ -205,10 +188,7 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
 def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State, dict[str, Any]]:
     """Return the state that a new run begins with, and its parts; some of these are another run's.
 
-    Args:
-        task: task of the new run.
-        seed: its seed.
-        donors: `agent`: run whose networks are taken; `reward`: run whose learned reward is taken.
+    Networks are those of the donor `agent`, the learned reward is that of the donor `reward`.
 
     Raises:
         InputError: a donor has no such part, or one of another size.
