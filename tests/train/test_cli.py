@@ -75,7 +75,9 @@ def whole(arm, tmp_path_factory):
     return out
 
 
-def test_a_run_survives_kill_9_and_ends_with_the_same_bits(whole, arm, tmp_path, capsys):
+def test_a_run_survives_kill_9_and_ctrl_c_and_ends_with_the_same_bits(
+    whole, arm, tmp_path, monkeypatch, capsys
+):
     killed = tmp_path / "killed"
     same_programs = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}  # from the cache
     process = subprocess.run(
@@ -85,9 +87,13 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(whole, arm, tmp_path,
     )
     assert process.returncode == -signal.SIGKILL and not (killed / "evaluation.json").exists()
     assert Run.open(killed).checkpoints.latest == 4 and len(Run.open(killed).metrics()) == 6
-    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
+        assert main(["reach", "--resume", str(killed)]) == 130
+    assert Run.open(killed).checkpoints.latest == len(Run.open(killed).metrics()) == 7
     assert main(["reach", "--resume", str(killed)]) == 0
-    assert "begins anew" not in capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "continue with --resume" in printed and "begins anew" not in printed
 
     (epoch, expected), (resumed_epoch, resumed) = final_state(whole), final_state(killed)
     assert epoch == resumed_epoch == 8
@@ -153,14 +159,6 @@ def test_export_reads_the_policy_before_it_distils(tmp_path, monkeypatch, capsys
     monkeypatch.setattr("train.runs.arm_model.arm_model", lambda *_: pytest.fail("distilled"))
     assert main(["export", str(tmp_path)]) == 2
     assert f"{tmp_path}: got no checkpoint, expected one" in capsys.readouterr().err
-
-
-def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "stopped"
-    monkeypatch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
-    assert main([*NEW, arm, "--out", str(out)]) == 130
-    assert "continue with" in " ".join(capsys.readouterr().out.split())
-    assert Run.open(out).checkpoints.latest == len(Run.open(out).metrics()) == 7
 
 
 @pytest.mark.parametrize("command", ["reach", "imitate", "sweep"])
