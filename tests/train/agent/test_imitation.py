@@ -122,6 +122,7 @@ def test_parts_of_other_runs_are_taken_if_they_fit(new):
     state, donor = init(jax.random.PRNGKey(0)), init(jax.random.PRNGKey(1))
     same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731
     shown = learner.parts(donor)
+    same(shown["policy"], learner.policy(donor))
     reward = shown.pop("reward")
     for parts in (shown, reach.parts(reach.init(jax.random.PRNGKey(2)))):  # of `imitate` and of `reach`
         taken = learner.adopt(state, parts)
