@@ -181,7 +181,7 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     results: Any
     summary, *results = task.evaluate(policy)
     write_json(run.path / EVALUATION_FILE, summary.to_dict())
-    plots.save(run.path, run.metrics(), *results)
+    plots.save(run.path, run.metrics(), summary, *results)
     return summary
 
 
