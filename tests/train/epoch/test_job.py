@@ -44,9 +44,8 @@ MOVING = {
 @pytest.mark.parametrize("change", [{}, {"engine": "mjx"}, MOVING], ids=["chain", "mjx", "dynamic"])
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
-    if (
-        config.env.in_motion
-    ):  # with goals that the episode reached later, and critics that observe a prediction
+    if config.env.in_motion:
+        # Goals that the episode reached later, and critics that observe a prediction.
         hindsight = dataclasses.replace(config.learner.hindsight, n_later=2)
         learner = dataclasses.replace(config.learner, hindsight=hindsight, n_ahead=2)
         config = dataclasses.replace(config, learner=learner)
