@@ -30,12 +30,12 @@ from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from train.config import TrainConfig, override
-from train.epoch.job import Epoch, FreshPoses, Job, State
+from train.epoch.job import Epoch, Job, State
 from train.options import start
 from train.runs.command import ReachOptions
 from train.runs.evaluate import Summary
 from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
-from train.runs.run import Interrupted, free_path, task_of, train_together
+from train.runs.run import FreshPoses, Interrupted, free_path, task_of, train_together
 
 RESULTS_FILE = "results.json"
 

@@ -114,10 +114,8 @@ class Expert:
                 pose = correct(s2r, pose, settled.spring_m)
                 plates = carry_body(*plates, pose)
             position_m, rotation = frame_from_pose(pose)
-        if self.pipe is None:
-            wall_m = jnp.full(1, _NO_WALL_M)
-        else:
-            wall_m = clearance(self.pipe, body_points(*plates, self.spec))
+        body_m = body_points(*plates, self.spec)
+        wall_m = jnp.full(1, _NO_WALL_M) if self.pipe is None else clearance(self.pipe, body_m)
         return Posture(
             pressure_kpa=pressure_kpa,
             spring_m=settled.spring_m,

@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,10 +20,12 @@ from tensorboardX import SummaryWriter
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.env.reach import POOL_SEED
+from mjx_softarm.mechanics.workspace import Pool
 from train.agent.learner import LearnerConfig
 from train.config import TrainConfig, name_of
 from train.demos.demonstrations import Demonstrations
-from train.epoch.job import FreshPoses, Job, State
+from train.epoch.job import Job, State
 from train.runs.evaluate import Evaluator, PositionEvaluator
 from train.runs.folder import EVALUATION_FILE, Run
 
@@ -66,6 +69,33 @@ def task_of_run(run: Run) -> Task:
         InputError: its demonstrations cannot be read.
     """
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations())
+
+
+class FreshPoses:
+    """Pools of poses that starts and goals are drawn from, each for some epochs of a run.
+
+    A policy that is trained for long on one pool learns the pool by heart: after 41,000 gradient steps,
+    `analytic` had 0.62 mm at the 16,384 poses of its pool and 0.79 mm at others. A thread draws the next pool
+    while the epochs of this one run. Without `fresh_poses_epochs`, the environment's own pool serves all.
+    """
+
+    def __init__(self, env: ReachEnv, config: TrainConfig):
+        self._pool, self._every = env.poses, config.fresh_poses_epochs
+        self._n_pools = -(-config.learner.n_epochs // self._every) if self._every else 1
+        self._seeds, self._thread = (POOL_SEED, config.seed), ThreadPoolExecutor(1)
+        self._futures: dict[int, Future[Pool]] = {}  # by number of the pool
+
+    def __call__(self, epoch: int) -> Pool:
+        """Return the pool of an epoch; from the second call on, begin to draw the pool that follows it."""
+        if not self._every:
+            return self._pool()
+        k = epoch // self._every
+        needed = [k, k + 1] if k in self._futures and k + 1 < self._n_pools else [k]
+        self._futures = {i: self._futures.get(i) or self._draw(i) for i in needed}
+        return self._futures[k].result()
+
+    def _draw(self, k: int) -> Future[Pool]:
+        return self._thread.submit(self._pool.draw, (*self._seeds, k))
 
 
 class Interrupted(Exception):

@@ -23,7 +23,7 @@ def epoch():
     """Arms that differ in payload, stiffness and sensor bias."""
     randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05)
     env = ReachEnv(SHORT, EnvConfig(engine="chain", n_poses=256, randomisation=randomisation))
-    return GradientEpoch(CONFIG, env)
+    return CONFIG.make_epoch(env)
 
 
 @pytest.fixture(scope="module")

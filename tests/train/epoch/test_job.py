@@ -12,7 +12,6 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from tests.arms import SHORT
 from tests.train.small import CONFIG, new_job
-from train.epoch.job import FreshPoses
 from train.runs import run
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -116,7 +115,7 @@ def pools():
     """Settings -> pools of a run, each for two of its epochs by default."""
     env = ReachEnv(SHORT, EnvConfig(n_poses=32, even_share=0.5))
     config = lambda every, seed: dataclasses.replace(CONFIG, fresh_poses_epochs=every, seed=seed)  # noqa: E731
-    return lambda every=2, seed=0: FreshPoses(env, config(every, seed))
+    return lambda every=2, seed=0: run.FreshPoses(env, config(every, seed))
 
 
 def test_a_pool_serves_some_epochs_and_each_run_has_its_own(pools):
@@ -129,6 +128,12 @@ def test_a_pool_serves_some_epochs_and_each_run_has_its_own(pools):
     np.testing.assert_array_equal(poses[4], pools()(4).pose)  # of a run that goes on
     lasting = pools(every=0)
     assert lasting(0) is lasting(5)
+
+
+def test_success_is_of_episodes_or_of_single_actions():
+    episodes = {"env/episodes": 8.0, "env/successes": 6.0}
+    for row, text in ((episodes, "exploring: success 75 % of episodes"), ({}, "success 50 % of actions")):
+        assert run._success([row | {"env/reached": 0.5}] * 2) == text
 
 
 def test_an_epoch_in_which_most_arms_in_motion_diverge_ends_the_run_and_names_the_step():
