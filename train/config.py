@@ -58,7 +58,7 @@ class TrainConfig:
     def evaluates_after(self, epoch: int) -> bool:
         """Return whether an evaluation and a checkpoint follow the n-th epoch."""
         last = self.learner.n_epochs
-        return epoch % self.evaluation_epochs == 0 or epoch in (last, *self.learner.milestones)
+        return epoch % self.evaluation_epochs == 0 or epoch in (last, *self.learner.stage_epochs)
 
 
 def override(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:

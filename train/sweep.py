@@ -35,7 +35,7 @@ from train.options import start
 from train.runs.command import ReachOptions
 from train.runs.evaluate import Summary
 from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
-from train.runs.run import Interrupted, free_path, fresh_poses, task_of, train_together
+from train.runs.run import FreshPoses, Interrupted, free_path, task_of, train_together
 
 RESULTS_FILE = "results.json"
 
@@ -85,15 +85,9 @@ def variable(config: TrainConfig) -> tuple[str, ...]:
 
 
 def members_of(config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]) -> dict[str, TrainConfig]:
-    """Return the members of a sweep, each seed with each combination of the varied numbers.
+    """Return the configs of a sweep's members by names such as `seed0-learner.gamma=0.5`.
 
-    Args:
-        config: settings that the members share.
-        seeds: seeds.
-        vary: NAME=VALUE,VALUE,... for each varied number.
-
-    Returns:
-        Configs by names such as `seed0-learner.gamma=0.5`.
+    Each seed comes with each combination of the varied numbers, each a NAME=VALUE,VALUE,... of `vary`.
 
     Raises:
         InputError: a setting is unknown or no number, or a value cannot be used or comes twice.
@@ -198,7 +192,7 @@ def train(path: Path, runs: Sequence[Run], console: Console) -> None:
     console.print("drawing goals from the reachable workspace ...")
     configs = [run.config for run in runs]
     env = ReachEnv(runs[0].spec, configs[0].env, runs[0].arm.s2r)
-    job = Job(MembersEpoch(configs[0], env), fresh_poses(configs[0], env))
+    job = Job(MembersEpoch(configs[0], env), FreshPoses(env, configs[0]))
     keys = jnp.stack([jax.random.PRNGKey(config.seed) for config in configs])
     numbers = {name: jnp.asarray(x, jnp.float32) for name, x in differing(runs).items()}
     tasks = {config.env: task_of(config, with_config(env, config)) for config in configs}

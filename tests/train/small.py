@@ -1,6 +1,5 @@
 """A short arm and a short run, which compile in seconds."""
 
-from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import EnvConfig
 from tests.arms import SHORT as SHORT
 from train.agent.tqc import TQCConfig
@@ -22,13 +21,6 @@ CONFIG = TrainConfig(learner=LEARNER, env=EnvConfig(engine="chain", n_poses=256)
 
 def new_job(config, env):
     return Job(config.learner.make_epoch(env))
-
-
-def distil_little(monkeypatch):
-    """Distil the networks of an arm from few poses, in seconds; test_estimator asks how exact they are."""
-    few = {"N_TRAINING": 512, "N_JUDGING": 256, "N_HELD_OUT": 64, "PAYLOADS": (0.0,)}
-    for name, value in {**few, "SCHEDULE": Schedule(10, 4e-3, 256)}.items():
-        monkeypatch.setattr(f"train.runs.arm_model.{name}", value)
 
 
 def flags(**changes):

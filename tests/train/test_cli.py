@@ -14,6 +14,7 @@ import pytest
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
@@ -21,7 +22,7 @@ from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from tests.arms import SHORT
-from tests.train.small import CONFIG, distil_little, flags, new_job
+from tests.train.small import CONFIG, flags, new_job
 from train.__main__ import main
 from train.runs.folder import Run, sole_trainer
 
@@ -74,7 +75,9 @@ def whole(arm, tmp_path_factory):
     return out
 
 
-def test_a_run_survives_kill_9_and_ends_with_the_same_bits(whole, arm, tmp_path, capsys):
+def test_a_run_survives_kill_9_and_ctrl_c_and_ends_with_the_same_bits(
+    whole, arm, tmp_path, monkeypatch, capsys
+):
     killed = tmp_path / "killed"
     same_programs = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}  # from the cache
     process = subprocess.run(
@@ -84,9 +87,13 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(whole, arm, tmp_path,
     )
     assert process.returncode == -signal.SIGKILL and not (killed / "evaluation.json").exists()
     assert Run.open(killed).checkpoints.latest == 4 and len(Run.open(killed).metrics()) == 6
-    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
+        assert main(["reach", "--resume", str(killed)]) == 130
+    assert Run.open(killed).checkpoints.latest == len(Run.open(killed).metrics()) == 7
     assert main(["reach", "--resume", str(killed)]) == 0
-    assert "begins anew" not in capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "continue with --resume" in printed and "begins anew" not in printed
 
     (epoch, expected), (resumed_epoch, resumed) = final_state(whole), final_state(killed)
     assert epoch == resumed_epoch == 8
@@ -110,8 +117,9 @@ def test_an_evaluation_with_a_payload_is_of_an_arm_that_carries_it(whole, monkey
 def test_an_exported_policy_asks_for_the_same_lengths_on_a_later_calibration(
     whole, tmp_path, monkeypatch, capsys
 ):
-    distil_little(monkeypatch)
-    monkeypatch.setattr("train.runs.arm_model.N_WORKSPACE", 256)
+    few = {"N_TRAINING": 512, "N_JUDGING": 256, "N_HELD_OUT": 64, "N_WORKSPACE": 256, "PAYLOADS": (0.0,)}
+    for name, value in {**few, "SCHEDULE": Schedule(10, 4e-3, 256)}.items():
+        monkeypatch.setattr(f"train.runs.arm_model.{name}", value)
     assert main(["export", str(whole)]) == 0
 
     # Later, the springs' zeros have shifted, and the arm was seen at other lengths
@@ -151,14 +159,6 @@ def test_export_reads_the_policy_before_it_distils(tmp_path, monkeypatch, capsys
     monkeypatch.setattr("train.runs.arm_model.arm_model", lambda *_: pytest.fail("distilled"))
     assert main(["export", str(tmp_path)]) == 2
     assert f"{tmp_path}: got no checkpoint, expected one" in capsys.readouterr().err
-
-
-def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "stopped"
-    monkeypatch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
-    assert main([*NEW, arm, "--out", str(out)]) == 130
-    assert "continue with" in " ".join(capsys.readouterr().out.split())
-    assert Run.open(out).checkpoints.latest == len(Run.open(out).metrics()) == 7
 
 
 @pytest.mark.parametrize("command", ["reach", "imitate", "sweep"])

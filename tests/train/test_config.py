@@ -77,16 +77,16 @@ def test_runs_without_an_activation_have_relu_networks():
     assert from_dict(data).learner.activation == "relu"
 
 
-def test_an_epoch_count_covers_the_steps_asked_for():
+def test_epochs_cover_the_steps_asked_for_and_updates_count_from_the_end_of_warm_up():
     config = TQCConfig(
-        total_env_steps=10_001, n_arms=100, vector_steps_per_epoch=10, updates_per_env_step=0.5
+        total_env_steps=10_001,
+        n_arms=100,
+        vector_steps_per_epoch=10,
+        updates_per_env_step=0.5,
+        warmup_env_steps=1_201,
     )
     assert (config.n_epochs, config.n_env_steps(11), config.n_decay_updates) == (11, 11_000, 11 * 10 * 50)
-
-
-def test_updates_are_counted_from_the_end_of_warm_up():
-    config = TQCConfig(n_arms=100, warmup_env_steps=1_201, vector_steps_per_epoch=10)
-    assert [config.n_updates(epoch) for epoch in (1, 2, 3)] == [0, 7 * 100, 17 * 100]
+    assert [config.n_updates(epoch) for epoch in (1, 2, 3)] == [0, 7 * 50, 17 * 50]
     assert AnalyticConfig().n_updates(3) == 3 * 256
     assert config.n_env_steps(epoch := 2**33) == 1_000 * epoch
 

@@ -118,7 +118,7 @@ def ready(env, job, monkeypatch):
     """Sweeps of the members train with the compiled job, and are evaluated by made-up figures."""
     evaluate = lambda actor_params: (MadeUp(actor_params),)  # noqa: E731
     task = Task(job=None, evaluate=evaluate, prepare=lambda state, epoch: state)
-    monkeypatch.setattr(plots, "save", lambda folder, rows: None)
+    monkeypatch.setattr(plots, "save", lambda folder, rows, figures: None)
     monkeypatch.setattr(sweep, "ReachEnv", lambda spec, config, s2r: env)
     monkeypatch.setattr(sweep, "Job", lambda epoch, pool_of: job)
     monkeypatch.setattr(sweep, "task_of", lambda config, env: task)

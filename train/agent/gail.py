@@ -77,8 +77,8 @@ class Gail:
         return DiscriminatorState(params, self.optimizer.init(params))
 
     def reward(self, params: Any, obs: Array, action: Array) -> Array:
-        """Return the learned reward (...) of actions (..., A) at observations (..., O)."""
-        return learned_reward(self.network.apply(params, *self._scaled(obs, action)))
+        """Return the learned reward (...) of actions (..., A) at observations (..., O), never positive."""
+        return jax.nn.log_sigmoid(self.network.apply(params, *self._scaled(obs, action)))
 
     def update(
         self,
@@ -101,7 +101,7 @@ class Gail:
         def loss(params: Any) -> tuple[Array, dict[str, Array]]:
             logits = functools.partial(self.network.apply, params)
             on_expert, on_agent = logits(*expert), logits(*agent)
-            entropy = cross_entropy(on_expert, on_agent)
+            entropy = jnp.mean(jax.nn.softplus(-on_expert)) + jnp.mean(jax.nn.softplus(on_agent))
             probability = lambda *pair: jax.nn.sigmoid(logits(*pair))  # noqa: E731
             on_logit = self.config.penalty_on == "logit"
             penalty = gradient_penalty(logits if on_logit else probability, *between)
@@ -114,16 +114,6 @@ class Gail:
 
     def _scaled(self, obs: Array, action: Array) -> tuple[Array, Array]:
         return self.config.input_scale * obs, self.config.input_scale * action
-
-
-def learned_reward(logits_expert_is_high: Array) -> Array:
-    """Return log sigmoid(h) (...), which is never positive: the paper's log(1 - D)."""
-    return jax.nn.log_sigmoid(logits_expert_is_high)
-
-
-def cross_entropy(expert_logits: Array, agent_logits: Array) -> Array:
-    """Return mean -log sigmoid(h) over expert logits (B,) plus mean -log(1 - sigmoid(h)) over agent ones."""
-    return jnp.mean(jax.nn.softplus(-expert_logits)) + jnp.mean(jax.nn.softplus(agent_logits))
 
 
 def gradient_penalty(score: Callable[[Array, Array], Array], obs: Array, action: Array) -> Array:

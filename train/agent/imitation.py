@@ -151,11 +151,6 @@ class ImitationConfig(TQCConfig):
         return tuple(round(share * self.n_epochs) for share in shares)
 
     @property
-    def milestones(self) -> tuple[int, ...]:
-        """Numbers of epochs at the ends of the stages."""
-        return self.stage_epochs
-
-    @property
     def rebalance_epochs(self) -> int:
         """Number of epochs between two shifts of the goals; 0 is never."""
         return -(-self.rebalance_env_steps // (self.n_arms * self.vector_steps_per_epoch))
@@ -198,7 +193,8 @@ class Imitation:
         key_between, key_update = jax.random.split(key)
         discriminator, metrics, stored = state.discriminator, {}, batch.stored
         assert stored is not None  # the epoch gives it
-        index = self._index_of(stored.goal)  # (B,) demonstrated positions that are the goals
+        away = jnp.sum((stored.goal[:, None] - self.positions) ** 2, axis=-1)  # (B, m)
+        index = jnp.argmin(away, axis=-1)  # (B,) demonstrated positions that are the goals
 
         # Batch: the first rows are exchanged for the expert's.
         batch = self.with_expert(batch, index)
@@ -282,10 +278,6 @@ class Imitation:
         return batch._replace(
             **{name: jnp.concatenate([rows, getattr(batch, name)[n:]]) for name, rows in expert.items()}
         )
-
-    def _index_of(self, goal: Array) -> Array:
-        """Return the indices (...) of the demonstrated positions that are the goals (..., 6)."""
-        return jnp.argmin(jnp.sum((goal[..., None, :] - self.positions) ** 2, axis=-1), axis=-1)
 
 
 class DemonstratedGoals:

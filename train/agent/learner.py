@@ -46,8 +46,8 @@ class LearnerConfig:
         return -(-self.total_env_steps // (self.n_arms * self.vector_steps_per_epoch))
 
     @property
-    def milestones(self) -> tuple[int, ...]:
-        """Numbers of epochs after which an evaluation follows in any case."""
+    def stage_epochs(self) -> tuple[int, ...]:
+        """Number of epochs before each stage of the run; an evaluation follows them in any case."""
         return ()
 
     def n_env_steps(self, epoch: int) -> int:

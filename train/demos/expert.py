@@ -13,7 +13,7 @@ With a sim-to-real network, poses and body are the real arm's, P_S2R; see `carry
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -76,106 +76,6 @@ class PostureTarget(NamedTuple):
     near_kpa: Any  # (n_chambers,) pressures of the previous posture
 
 
-def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
-    """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
-    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        settled = settle_pressures(params.without_pressure_limits(), pressure_kpa)
-        frames = chain_kinematics(params)(settled.q)
-        plates = frames.plate_position, frames.plate_rotation
-        pose = pose_from_frame(frames.tip_position, frames.tip_rotation)
-        if s2r is not None:
-            pose = correct(s2r, pose, settled.spring_m)
-            plates = carry_body(*plates, pose)
-        position_m, rotation = frame_from_pose(pose)
-    wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else clearance(pipe, body_points(*plates, spec))
-    return Posture(
-        pressure_kpa=pressure_kpa,
-        spring_m=settled.spring_m,
-        pose=pose,
-        finger_m=position_m - spec.mass.gripper_length_m * rotation[:, 2],
-        rotation=rotation,
-        clearance_m=jnp.min(wall_m),
-        residual=settled.residual,
-    ), wall_m
-
-
-@functools.cache  # at the first use, since options are looked up on a device
-def _compiled(function: Callable) -> Callable:
-    return xla.jit(function, static_argnames=("spec", "pipe"))
-
-
-def look_many(
-    pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None
-) -> Posture:
-    """Return the postures (n,) at pressures (n, n_chambers)."""
-    return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
-
-
-def solve_many(
-    starts_kpa: Array,
-    target: PostureTarget,
-    params: ArmParams,
-    s2r: S2R | None,
-    spec: ArmSpec,
-    pipe: CrossPipe | None,
-) -> Array:
-    """Return pressures (n, n_chambers) after damped Gauss-Newton steps from each of n starts."""
-    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-
-    def errors(pressure_kpa: Array) -> tuple[Array, Array]:
-        error = _errors(_posture(pressure_kpa, params, s2r, spec, pipe), target, spec)
-        return error, error
-
-    def model(pressure_kpa: Array) -> tuple[Array, Array]:
-        jacobian, error = jax.jacfwd(errors, has_aux=True)(pressure_kpa)
-        return error, jacobian
-
-    def step(_, state: Sequence[Array]):
-        # Keep the trial where it is better, and then trust the linear model more.
-        trial, *best, damping = state
-        tried = (trial, *model(trial))
-        better = jnp.sum(tried[1] ** 2) < jnp.sum(best[1] ** 2)  # false where the trial is NaN
-        best = [jnp.where(better, new, old) for new, old in zip(tried, best, strict=True)]
-        damping = jnp.clip(damping * jnp.where(better, 0.2, 10.0), 1e-6, 1e6)
-        # Take the damped Gauss-Newton step from the best pressures so far.
-        pressure, error, jacobian = best
-        hessian = jacobian.T @ jacobian
-        descent = jnp.linalg.solve(hessian + damping * jnp.diag(jnp.diag(hessian)), jacobian.T @ error)
-        return jnp.clip(pressure - descent, low, high), *best, damping
-
-    def solve(start):
-        error, jacobian = jax.eval_shape(model, start)
-        nothing = jnp.full(error.shape, jnp.inf), jnp.zeros(jacobian.shape)
-        return jax.lax.fori_loop(0, N_STEPS, step, (start, start, *nothing, jnp.float32(0.05)))[1]
-
-    return jax.vmap(solve)(starts_kpa)
-
-
-def _errors(posture: tuple[Posture, Array], target: PostureTarget, spec: ArmSpec) -> Array:
-    """Return the errors of a posture, each in its unit; limits count where they are violated."""
-    now, wall_m = posture
-    chambers = spec.chambers
-    shortest, longest = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
-    real_kpa = now.pressure_kpa + target.bias_kpa
-    room_kpa = jnp.concatenate([real_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - real_kpa])
-    room_m = jnp.concatenate([now.spring_m - shortest, longest - now.spring_m])
-    within = [
-        (room_kpa - MARGIN_KPA) / _LIMIT_KPA,
-        (room_kpa - COMFORT_KPA) / _COMFORT_KPA,
-        (room_m - SPRING_MARGIN_M) / _LIMIT_M,
-        (wall_m - MARGIN_M) / _LIMIT_M,
-        (wall_m - COMFORT_M) / _COMFORT_M,
-    ]
-    return jnp.concatenate(
-        [
-            (now.finger_m - target.finger_m) / _POSITION_M,
-            target.turn * angle_between(now.rotation, target.rotation) / _TURN_RAD,
-            *(jnp.minimum(value, 0.0) for value in within),
-            (now.pressure_kpa - target.near_kpa) / _NEAR_KPA,
-        ]
-    )
-
-
 def angle_between(rotation: Any, target: Any) -> Any:
     """Return sines (..., 3) of the turn from rotations (..., 3, 3) to a target (3, 3), in gripper axes."""
     xp = array_namespace(rotation)
@@ -194,11 +94,96 @@ class Expert:
     def __init__(self, spec: ArmSpec, s2r: S2R | None = None, pipe: CrossPipe | None = None):
         self.spec, self.pipe = spec, pipe
         self._limits_kpa = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-        arm = {"params": ArmParams.from_spec(spec), "s2r": s2r, "spec": spec, "pipe": pipe}
-        self._look, self._solve = (functools.partial(_compiled(f), **arm) for f in (look_many, solve_many))
+        springs = spec.springs
+        self._lengths_m = tuple(map(spec.at_springs, (springs.length_min_m, springs.length_max_m)))
+        arm = {"params": ArmParams.from_spec(spec), "s2r": s2r}
+        self._look = functools.partial(xla.jit(self._postures), **arm)
+        self._solve = functools.partial(xla.jit(self._solutions), **arm)
         self._rng = np.random.default_rng(0)
         pool = self.look(random_pressures(spec, N_POOL, self._rng))
         self._pool = jax.tree.map(lambda x: x[self._slack(pool).min(axis=-1) >= 0.0], pool)
+
+    def _posture(self, pressure_kpa: Array, params: ArmParams, s2r: S2R | None) -> tuple[Posture, Array]:
+        """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
+        with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+            settled = settle_pressures(params.without_pressure_limits(), pressure_kpa)
+            frames = chain_kinematics(params)(settled.q)
+            plates = frames.plate_position, frames.plate_rotation
+            pose = pose_from_frame(frames.tip_position, frames.tip_rotation)
+            if s2r is not None:
+                pose = correct(s2r, pose, settled.spring_m)
+                plates = carry_body(*plates, pose)
+            position_m, rotation = frame_from_pose(pose)
+        body_m = body_points(*plates, self.spec)
+        wall_m = jnp.full(1, _NO_WALL_M) if self.pipe is None else clearance(self.pipe, body_m)
+        return Posture(
+            pressure_kpa=pressure_kpa,
+            spring_m=settled.spring_m,
+            pose=pose,
+            finger_m=position_m - self.spec.mass.gripper_length_m * rotation[:, 2],
+            rotation=rotation,
+            clearance_m=jnp.min(wall_m),
+            residual=settled.residual,
+        ), wall_m
+
+    def _postures(self, pressure_kpa: Array, params: ArmParams, s2r: S2R | None) -> Posture:
+        """Return the postures (n,) at pressures (n, n_chambers)."""
+        return jax.vmap(lambda p: self._posture(p, params, s2r)[0])(pressure_kpa)
+
+    def _solutions(
+        self, starts_kpa: Array, target: PostureTarget, params: ArmParams, s2r: S2R | None
+    ) -> Array:
+        """Return pressures (n, n_chambers) after damped Gauss-Newton steps from each of n starts."""
+
+        def errors(pressure_kpa: Array) -> tuple[Array, Array]:
+            error = self._errors(*self._posture(pressure_kpa, params, s2r), target)
+            return error, error
+
+        def model(pressure_kpa: Array) -> tuple[Array, Array]:
+            jacobian, error = jax.jacfwd(errors, has_aux=True)(pressure_kpa)
+            return error, jacobian
+
+        def step(_, state: Sequence[Array]):
+            # Keep the trial where it is better, and then trust the linear model more.
+            trial, *best, damping = state
+            tried = (trial, *model(trial))
+            better = jnp.sum(tried[1] ** 2) < jnp.sum(best[1] ** 2)  # false where the trial is NaN
+            best = [jnp.where(better, new, old) for new, old in zip(tried, best, strict=True)]
+            damping = jnp.clip(damping * jnp.where(better, 0.2, 10.0), 1e-6, 1e6)
+            # Take the damped Gauss-Newton step from the best pressures so far.
+            pressure, error, jacobian = best
+            hessian = jacobian.T @ jacobian
+            descent = jnp.linalg.solve(hessian + damping * jnp.diag(jnp.diag(hessian)), jacobian.T @ error)
+            return jnp.clip(pressure - descent, *self._limits_kpa), *best, damping
+
+        def solve(start: Array) -> Array:
+            error, jacobian = jax.eval_shape(model, start)
+            nothing = jnp.full(error.shape, jnp.inf), jnp.zeros(jacobian.shape)
+            return jax.lax.fori_loop(0, N_STEPS, step, (start, start, *nothing, jnp.float32(0.05)))[1]
+
+        return jax.vmap(solve)(starts_kpa)
+
+    def _errors(self, now: Posture, wall_m: Array, target: PostureTarget) -> Array:
+        """Return the errors of a posture, each in its unit; limits count where they are violated."""
+        (low, high), (shortest, longest) = self._limits_kpa, self._lengths_m
+        real_kpa = now.pressure_kpa + target.bias_kpa
+        room_kpa = jnp.concatenate([real_kpa - low, high - real_kpa])
+        room_m = jnp.concatenate([now.spring_m - shortest, longest - now.spring_m])
+        within = [
+            (room_kpa - MARGIN_KPA) / _LIMIT_KPA,
+            (room_kpa - COMFORT_KPA) / _COMFORT_KPA,
+            (room_m - SPRING_MARGIN_M) / _LIMIT_M,
+            (wall_m - MARGIN_M) / _LIMIT_M,
+            (wall_m - COMFORT_M) / _COMFORT_M,
+        ]
+        return jnp.concatenate(
+            [
+                (now.finger_m - target.finger_m) / _POSITION_M,
+                target.turn * angle_between(now.rotation, target.rotation) / _TURN_RAD,
+                *(jnp.minimum(value, 0.0) for value in within),
+                (now.pressure_kpa - target.near_kpa) / _NEAR_KPA,
+            ]
+        )
 
     def look(self, pressure_kpa: np.ndarray) -> Posture:
         """Return the postures (n,) at pressures (n, n_chambers)."""
@@ -267,8 +252,7 @@ class Expert:
 
         Demands are equilibrium and clearance and, with a target, pressures, springs, position, orientation.
         """
-        springs = self.spec.springs
-        shortest, longest = map(self.spec.at_springs, (springs.length_min_m, springs.length_max_m))
+        shortest, longest = self._lengths_m
         margin_m = np.minimum(postures.spring_m - shortest, longest - postures.spring_m)
         clearance = postures.clearance_m / MARGIN_M - LIMIT_SHARE
         demands = [1.0 - postures.residual / RESIDUAL_TOLERANCE, clearance]

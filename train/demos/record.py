@@ -51,13 +51,9 @@ class RecordedPoses(NamedTuple):
 
 
 class WaypointRecorder:
-    """One arm, without pressure at first, with its expert.
+    """One arm, without pressure at first, with its expert; the arm may have motion capture.
 
-    Args:
-        arm: the arm, with or without motion capture.
-        expert: expert for the arm.
-        report: takes a line for each pose.
-        save: writes the log, if it has rows, once the arm is vented.
+    `report` takes a line for each pose; `save` writes the log, if it has rows, once the arm is vented.
     """
 
     def __init__(

@@ -71,18 +71,11 @@ def sample(replay: Ring, key: Array, batch_size: int) -> Items:
 def sample_ahead(
     replay: Ring, key: Array, batch_size: int, stride: int, n_ahead: int
 ) -> tuple[Items, Items, Array]:
-    """Draw items as `sample` does, and for each one an item that was added later.
+    """Draw items (B, ...) as `sample` does, and for each one an item (B, ...) that was added later.
 
-    Args:
-        replay: ring with at least one item.
-        key: PRNG key.
-        batch_size: number of items B.
-        stride: number of items that are added at once.
-        n_ahead: largest number of additions between an item and its later item.
-
-    Returns:
-        Items and later items (B, ...); the number of additions between the two, (B,) from 0 to `n_ahead`.
-        Where the ring does not have that later item yet, or an addition left rows out, it is unrelated.
+    The third result (B,) is the number of additions between the two, from 0 to `n_ahead`; `stride` items are
+    added at once. Where the ring does not have the later item yet, or an addition left rows out, that item is
+    unrelated.
     """
     key_slot, key_ahead = jax.random.split(key)
     slot = draws.integers(key_slot, batch_size, replay.size).astype(jnp.int32)

@@ -108,10 +108,8 @@ def arm_model(
 ) -> DistilledArm:
     """Return the model of an arm, which is distilled once in a process.
 
-    Args:
-        arm: the arm, calibrated or not.
-        folder: keeps the model in a file, which is used again for the same arm and the same code.
-        say: takes a text before each of `N_STEPS` steps; of none where the model is kept.
+    A file in `folder` keeps the model, and is used again for the same arm and the same code. `say` takes a
+    text before each of `N_STEPS` steps, of none where the model is kept.
 
     Raises:
         SpecError: the arm settles at too few pressures.
@@ -128,11 +126,7 @@ def arm_model(
 
 
 def distil(arm: CalibratedArm, say: Callable[[str], object] = lambda step: None) -> DistilledArm:
-    """Return the model of an arm, always the same for the same arm.
-
-    Args:
-        arm: the arm, calibrated or not.
-        say: takes a text before each step.
+    """Return the model of an arm, always the same for the same arm; `say` takes a text before each step.
 
     Raises:
         SpecError: the arm settles at too few pressures.

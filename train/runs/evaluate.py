@@ -288,19 +288,12 @@ def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: flo
     )
 
 
-class AtPositions(NamedTuple):
-    """Results at m demonstrated positions, in their order."""
-
-    reached: Reached  # (m, ...)
-    success: np.ndarray  # (m,) bool: close enough, no chamber saturated, the body inside the pipe
-
-
 @dataclass(frozen=True)
 class PositionSummary(Figures):
     """Figures at demonstrated positions."""
 
     error_mm: tuple[float, ...]  # tip error at each position
-    success: tuple[bool, ...]  # of each position
+    success: tuple[bool, ...]  # of each: close enough, no chamber saturated, the body inside the pipe
     success_share: float = figure("positions with success", "%", 1)
     success_first_share: float = figure("positions of the first stage with success", "%", 1)
     reached_share: float = figure("positions reached", "%", 1)  # with or without saturation and contact
@@ -339,24 +332,22 @@ class PositionEvaluator(_Evaluator):
         share, median_mm = row["evaluation/success_share"], row["evaluation/median_mm"]
         return f"success at {100 * share:.0f} % of the positions, median {median_mm:.1f} mm"
 
-    def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
+    def __call__(self, policy: Any) -> tuple[PositionSummary, Reached]:
         """Return figures, and results as NumPy arrays."""
         policy, m = jax.device_get(policy), len(self.positions)  # it may be on many devices
         passes = jax.device_get(self._go(policy, np.tile(self.positions, (2, 1)), start_keys(1)[0]))
         second = jax.tree.map(lambda x: x[m:], passes)
-        return summarise_positions(second, self.env.config.reward.threshold, self.first)
+        return summarise_positions(second, self.env.config.reward.threshold, self.first), second
 
 
-def summarise_positions(
-    reached: Reached, threshold: float, first: np.ndarray
-) -> tuple[PositionSummary, AtPositions]:
+def summarise_positions(reached: Reached, threshold: float, first: np.ndarray) -> PositionSummary:
     """Return the figures of results at m positions; `first` (m,) bool marks the goals of the first stage."""
     close = reached.scaled_error < threshold  # (m,)
     saturated, outside = reached.saturated_chambers > 0, reached.clearance_mm <= 0.0
     success = close & ~saturated & ~outside & reached.settled
     error_mm = reached.tip_error_mm
     x, y, z = np.abs(pose_error(reached.pose, reached.goal))[..., :3].mean(axis=0)
-    figures = PositionSummary(
+    return PositionSummary(
         success_share=float(success.mean()),
         success_first_share=float(success[first].mean()),
         reached_share=float(close.mean()),
@@ -371,4 +362,3 @@ def summarise_positions(
         error_mm=tuple(float(value) for value in error_mm),
         success=tuple(bool(value) for value in success),
     )
-    return figures, AtPositions(reached, np.asarray(success))

@@ -173,12 +173,6 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
     Measured once, not stored: policies of twins 0 to 2, each with the calibration of another twin,
     have medians of 0.1, 0.1, 3.6, 4.3, 9.2 and 13.2 mm with corrected goals, 17 to 42 mm without. On the
     circle of that twin they are 0.7, 0.7, 4.4, 5.7, 12.1 and 14.4 mm off.
-
-    Args:
-        before: the run.
-        now: the run with the later calibration.
-        calibration: folder of this calibration.
-        console: console to print to.
     """
     from calib.changes import MIN_TIP_MM
 
@@ -214,12 +208,9 @@ def _errors_mm(run: Run) -> dict[str, float]:
 
 
 def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
-    """Write the policy of a run's newest checkpoint; return the file.
+    """Write the policy of a run's newest checkpoint; return the file, by default `policy.npz` in the run.
 
-    Args:
-        run: folder with config and checkpoint; `actor_of` tells whether its policy can be written.
-        arm: model of the run's arm, as `arm_model` makes it of `run.arm`.
-        path: file to write; `policy.npz` in the run by default.
+    `arm` is the model that `arm_model` makes of `run.arm`; `actor_of` tells whether a policy can be written.
 
     Raises:
         SealedFileError: the file cannot be written.

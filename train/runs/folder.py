@@ -147,9 +147,7 @@ class Run:
         """Start a folder.
 
         Args:
-            path: folder to make.
-            config: all settings.
-            arm: the arm, calibrated or not.
+            path, config, arm: folder to make, all settings, and the arm.
             demonstrations: rows of the file of demonstrations, if the run learns from one.
             begins_with: folders of other runs whose parts the first state has, by part.
             first: first state with its parts, if it is not drawn from the seed.

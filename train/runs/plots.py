@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +11,20 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from train.runs.evaluate import AtPositions, Reached
+from train.runs.evaluate import Figures, PositionSummary, Reached
 
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
 DPI = 150
 STEPS = "environment steps"
 
 
-def save(folder: Path, rows: list[dict[str, Any]], result: Reached | AtPositions, *circle: Reached) -> None:
-    """Write the pictures of a run into its folder, from its metrics and the results of its evaluation."""
+def save(
+    folder: Path, rows: list[dict[str, Any]], figures: Figures, result: Reached, *circle: Reached
+) -> None:
+    """Write the pictures of a run into its folder, from its metrics and its evaluation."""
     pictures = {"learning_curve.png": learning_curve(rows)}
-    if isinstance(result, AtPositions):
-        pictures["positions.png"] = positions_figure(result)
+    if isinstance(figures, PositionSummary):
+        pictures["positions.png"] = positions_figure(result, figures.success)
     else:
         pictures |= {"circle.png": circle_figure(*circle), "workspace_error.png": workspace_figure(result)}
     for name, figure in pictures.items():
@@ -149,9 +152,8 @@ def workspace_figure(workspace: Reached) -> Figure:
     return figure
 
 
-def positions_figure(result: AtPositions) -> Figure:
+def positions_figure(reached: Reached, success: Sequence[bool]) -> Figure:
     """Draw demonstrated and reached poses from the front, and errors and clearances along them."""
-    reached = result.reached
     goal, pose, error = np.asarray(reached.goal), np.asarray(reached.pose), reached.tip_error_mm
     figure, (left, middle, right) = _figure(
         12,
@@ -164,7 +166,7 @@ def positions_figure(result: AtPositions) -> Figure:
     left.set_aspect("equal")
     left.legend(frameon=False, loc="upper right")
     position = np.arange(len(error))
-    middle.bar(position, error, color=np.where(result.success, BLUE, ORANGE))
+    middle.bar(position, error, color=np.where(success, BLUE, ORANGE))
     if np.isfinite(reached.clearance_mm).all():
         right.bar(position, reached.clearance_mm, color=BLUE)
     else:

@@ -13,7 +13,6 @@ from train.agent.analytic import Analytic, AnalyticConfig, GradientEpoch
 
 N_ARMS, N_UPDATES = 32, 150
 CONFIG = AnalyticConfig(hidden=(32, 32), n_arms=N_ARMS)
-FEW = dataclasses.replace(CONFIG, n_arms=4)
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -23,7 +22,7 @@ def epoch():
     """Arms that differ in payload, stiffness and sensor bias."""
     randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05)
     env = ReachEnv(SHORT, EnvConfig(engine="chain", n_poses=256, randomisation=randomisation))
-    return GradientEpoch(CONFIG, env)
+    return CONFIG.make_epoch(env)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +80,7 @@ def test_an_arm_that_does_not_settle_is_left_out_and_begins_anew(update, start):
 def test_the_gradient_of_moving_arms_looks_several_actions_ahead():
     """Against differences of the loss, for changes of the first and of the last of two actions."""
     env = ReachEnv(SHORT, EnvConfig(n_poses=64, mode="dynamic", dynamic_step_s=0.06, goal_ends=False))
-    epoch = GradientEpoch(dataclasses.replace(FEW, horizon=2), env)
+    epoch = GradientEpoch(dataclasses.replace(CONFIG, n_arms=4, horizon=2), env)
     state = jax.jit(epoch.first)(jax.random.PRNGKey(0))
     loss = jax.vmap(jax.value_and_grad(epoch._loss, has_aux=True), in_axes=(0, 0, None))
     at = jax.jit(lambda changes: loss(changes, state.arms, state.learner.actor_params))

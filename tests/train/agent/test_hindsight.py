@@ -10,7 +10,9 @@ import pytest
 
 from train.agent import hindsight
 from train.agent.hindsight import HindsightConfig, later_pose, relabel
-from train.agent.learner import Experience, Transition
+from train.agent.learner import Transition
+from train.agent.tqc import TQCConfig
+from train.epoch.replay_epoch import ReplayEpoch
 
 N_COPIES = 8  # of every transition, for shares that are as they should be
 
@@ -32,18 +34,8 @@ def transition(env, reset, step, random_actions):
 
 @pytest.fixture(scope="module")
 def stored(env, transition):
-    state, action, after = transition
-    start, end = state.pipeline_state, after.pipeline_state
-    return Experience(
-        pose=start.pose,
-        goal=start.goal,
-        action=action,
-        next_pose=end.pose,
-        sensed_action=env.action_of(end.spring_m),
-        saturated=after.info["saturated"],
-        clearance_cost=jnp.zeros(len(after.reward)),
-        n_steps=end.n_steps,
-    )
+    """The transitions as an epoch stores them."""
+    return ReplayEpoch(TQCConfig(), env, learner=None)._experience(*transition)
 
 
 @pytest.fixture(scope="module")

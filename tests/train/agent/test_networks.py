@@ -21,22 +21,6 @@ def relu(x):
     return np.maximum(x, 0.0)
 
 
-def test_actor_equals_the_same_layers_written_in_numpy():
-    actor = Actor(ACTION, hidden=(5, 4))
-    obs = jax.random.normal(jax.random.key(0), (2, 3, OBS))  # any leading axes
-    params = jax.jit(actor.init)(jax.random.key(1), obs)
-    mean, log_std = actor.apply(params, obs)
-
-    layers = params["params"]
-    x = np.asarray(obs, np.float64)
-    head = numpy_dense(
-        layers["head"], relu(numpy_dense(layers["hidden_1"], relu(numpy_dense(layers["hidden_0"], x))))
-    )
-    # Sums of fewer than 10 terms of order one, three layers deep: float32 leaves about 1e-6.
-    np.testing.assert_allclose(mean, head[..., :ACTION], atol=1e-5)
-    np.testing.assert_allclose(log_std, head[..., ACTION:], atol=1e-5)
-
-
 def test_log_std_is_clipped_at_both_ends():
     actor = Actor(1, hidden=())
     params = {"params": {"head": {"kernel": jnp.array([[0.0, 100.0]]), "bias": jnp.zeros(2)}}}

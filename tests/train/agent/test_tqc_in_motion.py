@@ -40,8 +40,8 @@ def params(critics, batch):
 def test_the_loss_of_the_critics_teaches_them_alone_and_so_does_that_of_the_prediction(
     critics, params, batch
 ):
-    by_critics = jax.grad(lambda params: jnp.sum(critics.apply(params, *batch[:2])))(params)
-    by_prediction = jax.grad(critics.loss)(params, *batch)
+    by_critics = jax.jit(jax.grad(lambda params: jnp.sum(critics.apply(params, *batch[:2]))))(params)
+    by_prediction = jax.jit(jax.grad(critics.loss))(params, *batch)
     for gradient, taught, other in (
         (by_critics, "critics", "predictor"),
         (by_prediction, "predictor", "critics"),

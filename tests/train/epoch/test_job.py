@@ -7,15 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from tests.arms import SHORT
 from tests.train.small import CONFIG, new_job
-from train.epoch.job import FreshPoses
 from train.runs import run
-from train.runs.folder import Run
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -46,9 +43,8 @@ MOVING = {
 @pytest.mark.parametrize("change", [{}, {"engine": "mjx"}, MOVING], ids=["chain", "mjx", "dynamic"])
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
-    if (
-        config.env.in_motion
-    ):  # with goals that the episode reached later, and critics that observe a prediction
+    if config.env.in_motion:
+        # Goals that the episode reached later, and critics that observe a prediction.
         hindsight = dataclasses.replace(config.learner.hindsight, n_later=2)
         learner = dataclasses.replace(config.learner, hindsight=hindsight, n_ahead=2)
         config = dataclasses.replace(config, learner=learner)
@@ -114,24 +110,12 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
     assert np.isfinite(state.arms.pipeline_state.chamber_stiffness).all()
 
 
-def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tmp_path):
-    checkpoints, state = Run.create(tmp_path, CONFIG, CalibratedArm(job.env.spec)).checkpoints, start(job)
-    with pytest.raises(InputError, match="got no checkpoint"):
-        checkpoints.restore(state)
-    checkpoints.save(0, state, job.learner.parts(state.learner))
-    for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
-        with pytest.raises(InputError, match=f"{tmp_path}/.*: got .* of other parts or sizes"):
-            checkpoints.restore(other)
-
-
-POSES = EnvConfig(n_poses=32, even_share=0.5)
-
-
 @pytest.fixture(scope="module")
 def pools():
-    """Arguments -> pools of a run of six epochs, each for two of them."""
-    env = ReachEnv(SHORT, POSES)
-    return lambda every=2, seed=0: FreshPoses(env, every, 6, seed)
+    """Settings -> pools of a run, each for two of its epochs by default."""
+    env = ReachEnv(SHORT, EnvConfig(n_poses=32, even_share=0.5))
+    config = lambda every, seed: dataclasses.replace(CONFIG, fresh_poses_epochs=every, seed=seed)  # noqa: E731
+    return lambda every=2, seed=0: run.FreshPoses(env, config(every, seed))
 
 
 def test_a_pool_serves_some_epochs_and_each_run_has_its_own(pools):

@@ -1,25 +1,20 @@
-"""The folder of a run: refused in words, its metrics forgotten with the epochs, its policy read alone."""
+"""The folder of a run: refused in words, its metrics forgotten with the epochs."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
-from tests.train.small import LEARNER
-from train.agent.analytic import AnalyticConfig
 from train.config import TrainConfig
 from train.epoch.replay_epoch import ReplayState
 from train.runs.folder import Run
 
 CONFIG, ARM = TrainConfig(), CalibratedArm(ArmSpec.default())
-
-pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):
@@ -48,23 +43,6 @@ def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
         file.write('{"epoch": 5, "cut')
     run.rewind(2)
     assert run.metrics() == [{"epoch": 1}, {"epoch": 2}]
-
-
-def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env, imitation_config, shown):
-    config, zero = imitation_config, jnp.zeros((), jnp.int32)
-    configs = {
-        "tqc": LEARNER,
-        "analytic": AnalyticConfig(hidden=(16,), n_arms=8),
-        "imitation": config.learner,
-    }
-    for name, learner_config in configs.items():
-        learner = learner_config.make_epoch(short_env, shown).learner
-        run = Run.create(tmp_path / name, config, CalibratedArm(short_env.spec))
-        with pytest.raises(InputError, match="got no checkpoint, expected one"):
-            run.policy()
-        state = jax.jit(learner.init)(jax.random.PRNGKey(0))
-        run.checkpoints.save(1, ReplayState(None, state, None, (), zero, zero), learner.parts(state))
-        jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(state)))
 
 
 @pytest.fixture
