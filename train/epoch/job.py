@@ -74,6 +74,10 @@ class Job:
         key = jax.random.PRNGKey(0) if key is None else key
         return jax.eval_shape(self._init, key, self.env.poses.shapes)
 
+    def compile_epoch(self) -> None:
+        """Compile the epoch before it is called."""
+        self._epoch = self._epoch.lower(self.shapes(), self.env.poses.shapes).compile()
+
     def start(self, first: Callable[[], T]) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled meanwhile.
 
@@ -81,5 +85,5 @@ class Job:
         """
         with ThreadPoolExecutor(1) as beside:
             result = beside.submit(first)
-            self._epoch = self._epoch.lower(self.shapes(), self.env.poses.shapes).compile()
+            self.compile_epoch()
             return result.result()
