@@ -112,116 +112,81 @@ def actor(controller: Controller) -> Computation:
     return Computation((observation,), {"action": actor_output(policy, observation)})
 
 
-class _Inputs(NamedTuple):
-    """Inputs of the loop's functions."""
-
-    readings: Symbol  # (n_springs,)
-    spring_m: Symbol  # (n_springs,)
-    reference_m: Symbol  # (n_springs,)
-    pressure_kpa: Symbol  # (n_chambers,)
-    springs_m: Symbol  # (window, n_springs)
-    pressures_kpa: Symbol  # (window, n_chambers)
-    goal: Symbol  # (6,)
-    pose: Symbol  # (6,)
-    load_kg: Symbol  # ()
-    stop: Symbol  # (n_chambers,)
-
-    @classmethod
-    def of(cls, controller: Controller) -> _Inputs:
-        spec, window = controller.policy.spec, controller.window
-        springs, chambers = (spec.n_springs,), (spec.n_chambers,)
-        windows = (window, *springs), (window, *chambers)
-        shapes = springs, springs, springs, chambers, *windows, (6,), (6,), (), chambers
-        doubles = cls(*(symbol(name, shape) for name, shape in zip(cls._fields, shapes, strict=True)))
-        return doubles._replace(pose=symbol("pose", (6,), np.float32))
-
-
 def parts(controller: Controller) -> dict[str, Computation]:
     """Record the functions of which `mjx_softarm.deploy.loop` consists, by their names in C++."""
-    inputs = _Inputs.of(controller)
-    return (
-        _acting_parts(controller, inputs)
-        | _judging_parts(controller, inputs)
-        | _search_parts(controller, inputs)
-    )
+    # Inputs that several functions share.
+    policy, window = controller.policy, controller.window
+    springs, chambers = (policy.spec.n_springs,), (policy.spec.n_chambers,)
+    readings, spring_m = symbol("readings", springs), symbol("spring_m", springs)
+    reference_m, pressure_kpa = symbol("reference_m", springs), symbol("pressure_kpa", chambers)
+    springs_m = symbol("springs_m", (window, *springs))
+    pressures_kpa = symbol("pressures_kpa", (window, *chambers))
+    goal, pose = symbol("goal", (6,)), symbol("pose", (6,), np.float32)
+    load_kg, stop = symbol("load_kg", ()), symbol("stop", chambers)
+    xp = array_namespace(readings)
 
-
-def _acting_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computation]:
-    """Record lengths, payload, pose, references and pressures."""
     # Belief.
-    policy, xp = controller.policy, array_namespace(inputs.readings)
-    reading = policy.sensor.lengths(inputs.readings, inputs.spring_m)
-    tip, away = tip_pose(policy, inputs.spring_m, inputs.load_kg)
-    means = xp.mean(inputs.springs_m, axis=0), xp.mean(inputs.pressures_kpa, axis=0)
-    estimated_kg, half_width_kg = estimate_load(policy.load_estimator, *means, inputs.stop)
-    last_m = symbol("last_m", inputs.spring_m.shape)
-    next_stop = hysteresis_after(policy, inputs.stop, last_m, inputs.spring_m)
+    reading = policy.sensor.lengths(readings, spring_m)
+    tip, away = tip_pose(policy, spring_m, load_kg)
+    means = xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0)
+    estimated_kg, half_width_kg = estimate_load(policy.load_estimator, *means, stop)
+    last_m = symbol("last_m", spring_m.shape)
+    next_stop = hysteresis_after(policy, stop, last_m, spring_m)
     # Policy.
     motion = _in_motion(policy.spec)
-    observed = sensed(policy, inputs.pose, inputs.spring_m, motion, inputs.load_kg)
-    action = action_towards(policy, inputs.pose, xp.asarray(inputs.goal, dtype=np.float32), observed)
+    observed = sensed(policy, pose, spring_m, motion, load_kg)
+    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
     # Law.
     sizes = policy.spec.n_chambers, policy.spec.n_springs, policy.spec.n_springs
     state = LawState(*(symbol(f"last_{name}", (n,)) for name, n in zip(LawState._fields, sizes, strict=True)))
-    written_kpa, next_state = pressures(
-        inputs.reference_m, inputs.spring_m, state, policy.gains, controller.dt_s
-    )
+    written_kpa, next_state = pressures(reference_m, spring_m, state, policy.gains, controller.dt_s)
     law = {"written_kpa": written_kpa} | {
         f"next_{name}": value for name, value in next_state._asdict().items()
     }
-    acting = inputs.pose, inputs.goal, inputs.spring_m, *motion, inputs.load_kg
-    return {
-        "lengths": _of(inputs.readings, inputs.spring_m, length_m=reading.length_m, lost=reading.lost),
-        "mean_length": _of(inputs.springs_m, mean_m=means[0]),
-        "hysteresis": _of(inputs.stop, last_m, inputs.spring_m, next_stop=next_stop),
-        "estimated_load": _of(
-            inputs.springs_m, inputs.pressures_kpa, inputs.stop, kg=estimated_kg, width_kg=half_width_kg
-        ),
-        "tip": _of(inputs.spring_m, inputs.load_kg, tip=tip, away=constant(away)),
+    acting = pose, goal, spring_m, *motion, load_kg
+    acts = {
+        "lengths": _of(readings, spring_m, length_m=reading.length_m, lost=reading.lost),
+        "mean_length": _of(springs_m, mean_m=means[0]),
+        "hysteresis": _of(stop, last_m, spring_m, next_stop=next_stop),
+        "estimated_load": _of(springs_m, pressures_kpa, stop, kg=estimated_kg, width_kg=half_width_kg),
+        "tip": _of(spring_m, load_kg, tip=tip, away=constant(away)),
         "references": _of(*acting, asked_m=policy.actions.lengths(action)),
-        "law": _of(inputs.reference_m, inputs.spring_m, *state, **law),
-        "vented": _of(inputs.pressure_kpa, next_kpa=vented(inputs.pressure_kpa, controller.dt_s)),
+        "law": _of(reference_m, spring_m, *state, **law),
+        "vented": _of(pressure_kpa, next_kpa=vented(pressure_kpa, controller.dt_s)),
     }
 
-
-def _judging_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computation]:
-    """Record rest, faults, and the way that remains."""
     # Rest and faults.
-    policy, rest = controller.policy, controller.rest
-    gains, xp = policy.gains, array_namespace(inputs.pose)
-    settled = on_reference(inputs.springs_m, inputs.reference_m, inputs.pressure_kpa, gains, rest.arrived_m)
-    mask = saturated(inputs.pressure_kpa, inputs.reference_m, inputs.spring_m, gains, policy.tolerance_m)
-    stuck = stuck_springs(inputs.springs_m, inputs.pressures_kpa, policy.spec.structure.n_sections)
-    lost = explained_by_pressure_loss(policy.spring_model, inputs.pressure_kpa, inputs.spring_m, gains)
+    rest, gains = controller.rest, policy.gains
+    settled = on_reference(springs_m, reference_m, pressure_kpa, gains, rest.arrived_m)
+    mask = saturated(pressure_kpa, reference_m, spring_m, gains, policy.tolerance_m)
+    stuck = stuck_springs(springs_m, pressures_kpa, policy.spec.structure.n_sections)
+    lost = explained_by_pressure_loss(policy.spring_model, pressure_kpa, spring_m, gains)
     # Error of a pose, and lengths that references make.
-    pose = xp.asarray(inputs.pose, dtype=np.float64)
-    weighted = weighted_error(pose, inputs.goal, policy.reward)
-    mean_m, asked_m = (symbol(name, inputs.spring_m.shape) for name in ("mean_m", "asked_m"))
-    lengths = inputs.reference_m, mean_m, asked_m, symbol("is_saturated", inputs.pressure_kpa.shape, bool)
-    return {
-        "still": _of(inputs.springs_m, holds=still(inputs.springs_m, rest.still_m)),
-        "on_reference": _of(inputs.springs_m, inputs.reference_m, inputs.pressure_kpa, holds=settled),
-        "saturated": _of(inputs.pressure_kpa, inputs.reference_m, inputs.spring_m, mask=mask),
-        "stuck": _of(inputs.springs_m, inputs.pressures_kpa, mask=stuck),
-        "explained_by_pressure_loss": _of(inputs.pressure_kpa, inputs.spring_m, mask=lost),
-        "left": _of(
-            inputs.pose, inputs.goal, off=asked_error(pose, inputs.goal, policy.reward), error=weighted
-        ),
+    exact = xp.asarray(pose, dtype=np.float64)
+    weighted = weighted_error(exact, goal, policy.reward)
+    mean_m, asked_m = (symbol(name, spring_m.shape) for name in ("mean_m", "asked_m"))
+    lengths = reference_m, mean_m, asked_m, symbol("is_saturated", pressure_kpa.shape, bool)
+    judges = {
+        "still": _of(springs_m, holds=still(springs_m, rest.still_m)),
+        "on_reference": _of(springs_m, reference_m, pressure_kpa, holds=settled),
+        "saturated": _of(pressure_kpa, reference_m, spring_m, mask=mask),
+        "stuck": _of(springs_m, pressures_kpa, mask=stuck),
+        "explained_by_pressure_loss": _of(pressure_kpa, spring_m, mask=lost),
+        "left": _of(pose, goal, off=asked_error(exact, goal, policy.reward), error=weighted),
         "followed": _of(*lengths, lengths_m=followed(*lengths, policy)),
     }
 
-
-def _search_parts(controller: Controller, inputs: _Inputs) -> dict[str, Computation]:
-    """Record the tests of a goal: among reachable poses, and by a search."""
-    policy, goal, start = controller.policy, inputs.goal, constant(reach.begin(controller.policy, 1))
+    # Tests of a goal: among reachable poses, and by a search.
+    start = constant(reach.begin(policy, 1))
     search = symbol("search", start.shape)
     nearest, error = reach.nearest_of(policy, goal[None], search)
-    return {
+    searches = {
         "inside": _of(goal, holds=_inside(controller, goal)),
         "search_begin": _of(search=start),
         "search_step": _of(goal, search, next=reach.improve(policy, goal[None], search)),
         "search_end": _of(search, goal, nearest=nearest[0], error=error[0]),
     }
+    return acts | judges | searches
 
 
 def _of(*inputs: Symbol, **outputs: Symbol) -> Computation:

@@ -207,7 +207,7 @@ class _Body:
         if item.op == "input":
             return f"{item.option}[{i}]"
         if item.op == "constant":
-            return self._constant(np.asarray(item.value), i)
+            return self._constant(np.asarray(item.option), i)
         if item.op == "reshape":
             return self._value(item.operands[0], i)
         if item.op == "index":

@@ -143,7 +143,7 @@ class _Writer:
         if item.op == "input":
             return item.option
         if item.op == "constant":
-            return self.tensor(item.value)
+            return self.tensor(item.option)
         if item.op in _OPERATORS:
             return self.node(_OPERATORS[item.op], names)
         return getattr(self, f"_{item.op}")(item, *names)

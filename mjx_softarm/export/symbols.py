@@ -8,7 +8,7 @@ NumPy itself decides shapes and types: every operation is tried on arrays of one
 The operations are NumPy's functions of the same name. All are elementwise except
 
     input                            `option`: its name
-    constant                         `value`: its array
+    constant                         `option`: its array
     cast, reshape                    type and shape are the symbol's
     index                            `option`: places (shape) of the elements in the flat operand
     concat, sum, min, max, all       `option`: the axis, or a tuple of axes
@@ -37,7 +37,6 @@ class Symbol:
     shape: tuple[int, ...]
     dtype: np.dtype
     option: Any = None
-    value: np.ndarray | None = None  # array of a constant
 
     __array_ufunc__ = None  # NumPy arrays leave operators to this class
 
@@ -118,7 +117,7 @@ def constant(value: Any) -> Symbol:
     if isinstance(value, Symbol):
         return value
     array = np.asarray(value)
-    return Symbol("constant", (), array.shape, array.dtype, value=array)
+    return Symbol("constant", (), array.shape, array.dtype, array)
 
 
 def elementwise(name: str, *operands: Any) -> Symbol:
