@@ -94,12 +94,13 @@ def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> Step
     """Fit pumps or regulators to commanded and measured pressures, or to commands and springs."""
     spec = arm.spec
     tracks, lag = find_tracks(measurements.logs, spec), MEASURED
-    if not tracks and measurements.poses.n >= MIN_POSES:
+    poses = measurements.poses.with_lengths(spec)
+    if not tracks and len(_unloaded(poses, spec)) >= MIN_POSES:
         # No pressure was measured: the springs are the gauge, and the shape shows the arm's own lag
         tracks = find_tracks(measurements.logs, spec, functools.partial(pressures_by_springs, arm))
         shape = fit_shape(measurements.logs, arm) if tracks else None
         known = spec.shape_lag_s, PRIOR
-        if shape is not None and shape.is_better:
+        if shape is not None and shape.is_known:
             known = shape.lag_s, shape.log_std
         lag = ArmLag.of_shape(*known)
     if not tracks:
@@ -126,10 +127,10 @@ def damping(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepRe
     if not stretches:
         needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
         return StepResult(arm, Section("Damping", f"{NOT_FITTED} {needed}"))
-    # The lag of the shape shows the backbone's damping by itself
+    # The lag of the shape shows the backbone's damping by itself, if it is known well
     shape, bending = fit_shape(measurements.logs, arm), None
-    if shape is not None and np.isfinite(shape.log_std):
-        spec, bending = shape.spec if shape.is_better else spec, shape.half_width_s / shape.lag_s
+    if shape is not None and shape.is_known:
+        spec, bending = shape.spec, shape.half_width_s / shape.lag_s
     fit = fit_damping(stretches, spec, seed, bending)
     return StepResult(arm._replace(spec=fit.spec if fit.is_better else spec), sections.damping(fit, shape))
 

@@ -57,7 +57,7 @@ def main(
                 function = pkgutil.resolve_name(command) if isinstance(command, str) else command
                 return finish(name, parse(function, f"{prog} {name}", words[n_words:])())
         # List all commands, or those of a group such as `demos`.
-        group = list(itertools.takewhile(lambda word: word not in ("-h", "--help"), words))
+        group = list(itertools.takewhile(lambda word: not word.startswith("-"), words))
         shown = [name for name in commands if name.split()[: len(group)] == group]
         if not shown:
             raise InputError(f"{prog}: got {' '.join(group)!r}, expected one of {', '.join(commands)}")

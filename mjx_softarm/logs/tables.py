@@ -101,7 +101,9 @@ def _read_csv(path: Path) -> Table:
 def _check_text(path: Path, head: bytes) -> None:
     if not head.strip():
         raise _error(path, "got an empty file, expected a header and rows")
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+    # Some loggers write UTF-16 without its mark: every other byte is zero.
+    zeros_alternate = 0 in head and any(head[:512:2]) != any(head[1:512:2])
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")) or zeros_alternate:
         raise _error(path, "got UTF-16 text, expected UTF-8; save the file again with that encoding")
     if 0 in head:
         raise _error(path, "got a binary file, expected CSV text (or npz, by the end of its name)")

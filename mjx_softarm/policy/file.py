@@ -188,7 +188,7 @@ def save_policy(path: str | Path, policy: Policy) -> None:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Read a policy and check all of it.
+    """Read a policy, and check the types, shapes and names of its entries.
 
     Raises:
         SealedFileError: the file is no policy of this version, is damaged, or has a wrong entry.

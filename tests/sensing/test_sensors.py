@@ -74,6 +74,8 @@ def test_bad_readings_are_reported_and_hold_their_fallback(convert):
     reading = convert(sensor, bad, last_good)
     assert reading.lost.all()
     np.testing.assert_array_equal(reading.length_m, last_good)
+    one_bad = convert(sensor, np.float32([math.nan] + 8 * [1.0e6]), last_good)
+    assert one_bad.lost.tolist() == [True] + 8 * [False]
     *beyond, no_coil = sensor.describe_lost(bad, reading.lost)
     assert all(text.endswith("Hz, expected 100000 to 1e+07 Hz") for text in beyond)
     assert "got 9000000 Hz, expected below 8761191 Hz, where the compensation resonates" in no_coil

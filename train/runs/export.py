@@ -213,7 +213,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
     `arm` is the model that `arm_model` makes of `run.arm`; `actor_of` tells whether a policy can be written.
 
     Raises:
-        SealedFileError: the file cannot be written.
+        InputError: the policy is not one that the file can hold, or the file cannot be written.
     """
     # Say how the policy came about: the run's config with versions and commit, and the arm's networks.
     provenance = {
@@ -224,17 +224,20 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
     }
     # Put all together; this checks the shapes of the parameters.
     env = run.config.env
-    policy = policy_from_actor(
-        run.policy(),
-        run.spec,
-        env.reward,
-        arm.model,
-        provenance,
-        activation=run.config.learner.activation,
-        observation=env.observation,
-        n_actions=N_ACTIONS,
-        action_s=env.dynamic_step_s if env.in_motion else 0.0,
-    )
+    try:
+        policy = policy_from_actor(
+            run.policy(),
+            run.spec,
+            env.reward,
+            arm.model,
+            provenance,
+            activation=run.config.learner.activation,
+            observation=env.observation,
+            n_actions=N_ACTIONS,
+            action_s=env.dynamic_step_s if env.in_motion else 0.0,
+        )
+    except ValueError as error:
+        raise InputError(f"{run.path}: {error}") from error
     path = path or run.path / "policy.npz"
     save_policy(path, policy)
     return path

@@ -93,6 +93,8 @@ class Checkpoints:
             raise InputError(f"{self.run}: got no checkpoint, expected one; start the run anew")
         try:
             return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
+        except (MemoryError, PermissionError):
+            raise
         except Exception as error:  # orbax raises many kinds
             reason = str(error).partition("\n")[0][:200]
             folder = self.path / str(epoch)

@@ -43,7 +43,7 @@ STEP_KPA, STEP_S = 1.5, 1.0
 LAGS_S = np.geomspace(0.02, 3.0, 41)
 LOG_STEP = float(np.log(LAGS_S[1] / LAGS_S[0]))
 BLOCK_S = 10.0  # errors within this time are not independent
-MARGIN = 0.98  # ratio of errors below which the fitted lag counts as better than the specification's
+KNOWN = 0.5  # relative half-width of the interval up to which a lag counts as known; by hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +64,9 @@ class ShapeFit:
         return self.lag_s in (LAGS_S[0], LAGS_S[-1])
 
     @property
-    def is_better(self) -> bool:
-        """Whether the fitted lag explains the tip better than the specification's."""
-        return not self.at_end and self.rms_mm < MARGIN * self.before_rms_mm
+    def is_known(self) -> bool:
+        """Whether the fitted lag is known well enough to stand for the backbone's damping."""
+        return self.half_width_s <= KNOWN * self.lag_s
 
     @property
     def half_width_s(self) -> float:

@@ -121,7 +121,8 @@ class SerialArm:
 
         # Its answer; answers to earlier requests are skipped.
         while (left_s := end_s - time.monotonic()) > 0.0:
-            words = self.receive(left_s).decode("ascii", "replace").split()
+            line = self.receive(left_s).decode("ascii", "replace")
+            words = line.split() if line.endswith("\n") else []  # a cut answer counts as none
             if words[1:2] != [str(self._count)]:
                 continue
             head, _, *words = words

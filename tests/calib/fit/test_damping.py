@@ -59,6 +59,17 @@ def test_what_is_left_is_noise(fitted):
     assert fitted.time_s == pytest.approx(15.0, abs=0.1)
 
 
+def test_a_known_bending_damping_stays_and_keeps_its_interval(log):
+    """Only the chambers' damping is fitted; the backbone's is the planted one."""
+    spec = damped(SPEC, np.log([1.0, FACTORS[1]]))
+    found = fit_damping(find_stretches([log], SPEC), spec, bending_half_width=0.1)
+    bending = spec.backbone.bending_damping_nms_per_rad
+    assert found.spec.backbone.bending_damping_nms_per_rad == bending
+    assert found.half_width_95["bending_damping_nms_per_rad"] == pytest.approx(0.1 * bending)
+    planted = FACTORS[0] * SPEC.chambers.damping_ns_per_m
+    assert found.spec.chambers.damping_ns_per_m == pytest.approx(planted, rel=0.05)
+
+
 def test_small_steps_are_said_not_to_tell_the_damping(log):
     calm = moving_log(SPEC, steps(12) * 0.02 - 10.0)
     assert fit_damping(find_stretches([calm], SPEC), SPEC).warnings

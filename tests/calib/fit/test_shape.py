@@ -56,7 +56,7 @@ def long():
 def test_a_planted_damping_comes_back(quick):
     own, planted = fit_shape([log_of(1.0)], ARM), fit_shape([quick], ARM)
     assert planted.lag_s == pytest.approx(0.25 * own.lag_s, rel=0.25)
-    assert planted.is_better and planted.rms_mm < 0.7 * planted.before_rms_mm
+    assert planted.is_known and planted.rms_mm < 0.7 * planted.before_rms_mm
     assert planted.spec.shape_lag_s == pytest.approx(planted.lag_s)
     assert planted.before_s == SPEC.shape_lag_s
     for found, factor in ((own, 1.0), (planted, 0.25)):
@@ -94,7 +94,7 @@ def test_a_log_is_cut_where_lengths_are_missing(long):
 def test_a_lag_beyond_those_tried_is_not_believed(quick, monkeypatch):
     monkeypatch.setattr(shape, "LAGS_S", shape.LAGS_S[shape.LAGS_S > 0.3])
     found = fit_shape([quick], ARM)
-    assert found.at_end and not found.is_better and found.log_std == np.inf
+    assert found.at_end and not found.is_known and found.log_std == np.inf
     assert found.rms_mm < 0.98 * found.before_rms_mm
     section = sections.damping(DAMPING, found)
     assert "the best lag of the shape, 0.31 s, is an end of those tried" in section.warnings[-1]

@@ -14,6 +14,7 @@ UNREADABLE = {
     "semicolons": (simple(moving(9)).replace(",", ";"), "line 1: .*got semicolons"),
     "decimal commas": (simple([r.replace(".", ",") for r in moving(9)]), "2: got 8 cells .decimal commas"),
     "UTF-16": (simple(moving(9)).encode("utf-16"), "UTF-16 text, expected UTF-8"),
+    "UTF-16 without a mark": (simple(moving(9)).encode("utf-16-le"), "UTF-16 text, expected UTF-8"),
     "binary": (bytes(range(256)) * 40, "a binary file, expected CSV"),
     "late binary": ((simple(moving(4000)) + "\x00\x01,2,3,4\n").encode(), r"line 4002: time \[s\]: got"),
     "ragged": (simple([*moving(5), "0.1,0.2,0.3", *moving(9, 6)]), "line 7: got 3 cells, expected 4"),

@@ -191,6 +191,15 @@ def test_stages_change_the_goals_and_thin_the_replay(job, goals, run):
     assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
 
 
+def test_a_run_is_traced_once_and_continues_bit_for_bit_across_a_stage(job, run):
+    whole, metrics = run(job.init(jax.random.PRNGKey(2)), 0, 6)
+    part, _ = run(job.init(jax.random.PRNGKey(2)), 0, 4)
+    part = jax.tree.map(jnp.asarray, jax.device_get(part))
+    resumed, _ = run(part, 4, 6)
+    assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole), jax.device_get(resumed))
+
+
 def test_goals_shift_to_the_positions_that_are_missed_by_most():
     weight = goal_weights(np.array([1.0, 9.0, 3.0, 0.0]), np.array([True, False, True, True]))
     np.testing.assert_allclose(weight, [1 / 6 + 1 / 8, 0.0, 1 / 6 + 3 / 8, 1 / 6])

@@ -96,7 +96,7 @@ def task():
 
 @pytest.fixture(scope="module", autouse=True)
 def known():
-    """The learner stands in the registry."""
+    """The learner stands among those of `train.config`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(LEARNERS, "regression", RegressionConfig)
         yield
