@@ -61,7 +61,7 @@ TOLERANCES: dict[str, Any] = {"max_nfev": 60, "ftol": 1e-6, "xtol": 1e-3, "gtol"
 # Standard deviation of the logarithms of lag and dead time by the springs, beside that of the fit: the arm is
 # more than some lags. Planted lags of 0.5 and 0.8 s of rods came out 1 % above and 4 % below.
 BY_SPRINGS = 0.05
-# The same of the regulators' lag, as a share of the arm's own lag, which the springs cannot tell apart from it.
+# The same of the regulators' lag, as a share of the arm's own lag, from which springs hardly tell it apart.
 # Beside arms that lag by 0.25 s, lags of 0.15 s came out as 0.19 and 0.21 s, one of 0.81 s as 0.75 s.
 OF_ARM_LAG = 0.3
 # Error from which the actuators are of another kind: in the noise of the pressures, and at least
