@@ -175,18 +175,21 @@ def parts(controller: Controller) -> dict[str, Computation]:
         "left": _of(pose, goal, off=asked_error(exact, goal, policy.reward), error=weighted),
         "followed": _of(*lengths, lengths_m=followed(*lengths, policy)),
     }
+    return acts | judges | _goal_tests(controller)
 
-    # Tests of a goal: among reachable poses, and by a search.
+
+def _goal_tests(controller: Controller) -> dict[str, Computation]:
+    """Record the tests of a goal: among reachable poses, and by a search."""
+    policy, goal = controller.policy, symbol("goal", (6,))
     start = constant(reach.begin(policy, 1))
     search = symbol("search", start.shape)
     nearest, error = reach.nearest_of(policy, goal[None], search)
-    searches = {
+    return {
         "inside": _of(goal, holds=_inside(controller, goal)),
         "search_begin": _of(search=start),
         "search_step": _of(goal, search, next=reach.improve(policy, goal[None], search)),
         "search_end": _of(search, goal, nearest=nearest[0], error=error[0]),
     }
-    return acts | judges | searches
 
 
 def _of(*inputs: Symbol, **outputs: Symbol) -> Computation:

@@ -50,6 +50,20 @@ def test_csv_is_what_a_plain_reader_expects(tmp_path):
         assert float(row["goal_roll [deg]"]) == pytest.approx(log.goal[n, 5], rel=1e-8)
 
 
+def test_failed_write_leaves_the_old_file_and_no_part(tmp_path, monkeypatch):
+    def fail(file, *_, **__):
+        file.write(b"time [s]\n0.0")
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "log.csv"
+    path.write_text("old")
+    monkeypatch.setattr(np, "savetxt", fail)
+    with pytest.raises(OSError, match="No space left"):
+        write_log(path, small_log())
+    assert path.read_text() == "old"
+    assert [item.name for item in tmp_path.iterdir()] == ["log.csv"]
+
+
 def numbers(*shape):
     return npst.arrays(float, shape, elements=st.floats(-1e30, 1e30))
 

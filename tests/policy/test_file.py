@@ -12,6 +12,7 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import archive
 from mjx_softarm._support.archive import SealedFileError, sealed
+from mjx_softarm.control import allocation
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
@@ -92,8 +93,13 @@ def test_other_arms_and_observations_are_kept(tmp_path, make_arm_model, spec, ob
     save_policy(path, policy)
     again = load_policy(path)
     assert_same(again, policy)
-    assert len(again.actions.low) == spec.n_springs and again.obs_layout == names
+    assert again.spec == spec and len(again.actions.low) == spec.n_springs
+    assert tuple(arrays_of(path)["obs_layout"]) == again.obs_layout == names
     assert arrays_of(path)["action_layout"].tolist() == [f"frequency{k}" for k in range(spec.n_springs)]
+    expected = allocation(spec)
+    assert (again.gains.allocation is None) == (expected is None)
+    for one, other in zip(again.gains.allocation or (), expected or (), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_networks_of_another_arm_are_refused(make_arm_model):

@@ -210,7 +210,7 @@ def _errors_mm(run: Run) -> dict[str, float]:
 def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
     """Write the policy of a run's newest checkpoint; return the file, by default `policy.npz` in the run.
 
-    `arm` is the model that `arm_model` makes of `run.arm`; `actor_of` tells whether a policy can be written.
+    `arm` is the model that `arm_model` makes of `run.arm`.
 
     Raises:
         InputError: the policy is not one that the file can hold, or the file cannot be written.
