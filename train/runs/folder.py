@@ -32,6 +32,8 @@ else:
 CONFIG_FILE, EVALUATION_FILE, METRICS_FILE = "config.json", "evaluation.json", "metrics.jsonl"
 DEMONSTRATIONS_FILE, LOCK_FILE = "demonstrations.npz", "training.lock"
 N_KEPT = 2  # checkpoints
+# Codes that begin a message of TensorStore about files that are cut, changed or absent
+_DAMAGE = ("DATA_LOSS", "OUT_OF_RANGE", "NOT_FOUND", "FAILED_PRECONDITION")
 
 
 class Checkpoints:
@@ -93,18 +95,32 @@ class Checkpoints:
             raise InputError(f"{self.run}: got no checkpoint, expected one; start the run anew")
         try:
             return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
-        except (MemoryError, PermissionError):
-            raise
-        except Exception as error:  # orbax raises many kinds
-            reason = str(error).partition("\n")[0][:200]
+        except Exception as error:
             folder = self.path / str(epoch)
-            earlier = [saved for saved in self.epochs if saved < epoch]
-            remedy = f", or go back to epoch {earlier[-1]} without {folder}" if earlier else ""
+            if _is_damage(folder / item, error):
+                earlier = [saved for saved in self.epochs if saved < epoch]
+                remedy = f"; without {folder} the run goes back to epoch {earlier[-1]}" if earlier else ""
+                raise InputError(
+                    f"{folder / item}: got a damaged checkpoint ({str(error).splitlines()[0][:200]}), "
+                    f"expected it as it was written{remedy}"
+                ) from error
+            if not isinstance(error, (ValueError, KeyError)):
+                raise
             raise InputError(
-                f"{folder / item}: got a damaged checkpoint, or one of other parts or sizes "
-                f"({reason}), expected this version's; "
-                f"continue with the commit that config.json names{remedy}"
+                f"{self.run}: got a checkpoint of other parts or sizes, expected this version's; "
+                "continue it with the commit that its config.json names"
             ) from error
+
+
+def _is_damage(folder: Path, error: Exception) -> bool:
+    """Return whether the files of a checkpoint's item are damaged, rather than those of another version."""
+    chain = (error, error.__cause__)  # the reading of an array fails in a thread
+    unread = isinstance(error, (UnicodeDecodeError, json.JSONDecodeError, FileNotFoundError))
+    return (
+        unread
+        or not (folder / "_METADATA").exists()
+        or any(code in str(one) for one in chain if one is not None for code in _DAMAGE)
+    )
 
 
 def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:

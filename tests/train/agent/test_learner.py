@@ -135,7 +135,7 @@ def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, arm):
 def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
     learner = TQCConfig(**{**dataclasses.asdict(SETTINGS), "hindsight": SETTINGS.hindsight})
     other = task_of(dataclasses.replace(CONFIG, learner=learner), task.job.env)
-    with pytest.raises(InputError, match=f"{run.path}/checkpoints/.*: got .* of other parts or sizes"):
+    with pytest.raises(InputError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
         run.checkpoints.restore(other.job.shapes())
     with pytest.raises(InputError, match=f"{run.path}: got a policy without critics"):
         begin_with(other, 0, {"agent": run})
