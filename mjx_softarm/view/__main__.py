@@ -30,16 +30,6 @@ HINT = "try next: hang 500 g with the payload slider; the loop estimates it and 
 
 
 @dataclass(frozen=True)
-class Address:
-    """Address of the page."""
-
-    host: str = HERE
-    """address to listen on; with another one everybody who reaches it can move the arm"""
-    port: int = 8080
-    """port to listen on; the next free one, if it is taken"""
-
-
-@dataclass(frozen=True)
 class Steered(DriverOptions):
     """Arm that the page steers, and its policy."""
 
@@ -71,7 +61,8 @@ def _view(
     demos: cli.MaybePath = None,
     spec: cli.SpecFile = None,
     html: cli.MaybePath = None,
-    at: Annotated[Address, tyro.conf.arg(name="")] = Address(),
+    host: str = HERE,
+    port: int = 8080,
 ) -> int:
     """Show an arm in the browser and steer it there, or replay logs.
 
@@ -80,6 +71,8 @@ def _view(
         log: file for the log of the steered run, CSV or npz
         demos: file for demonstrations, poses taken on the page for `train imitate`, CSV or npz
         html: file to write the logs to, as a page that plays without a server
+        host: address to listen on; with another one everybody who reaches it can move the arm
+        port: port to listen on; the next free one, if it is taken
     """
     # Check the options before anything is opened.
     with needing("view", "view"):
@@ -88,7 +81,7 @@ def _view(
     check_file("--demos", demos)
     check_file("--html", html, (".html", ".htm"))
     if logs:
-        return _replay(logs, ArmSpec.of(spec), html, at)
+        return _replay(logs, ArmSpec.of(spec), html, host, port)
     if html is not None:
         raise InputError("--html: got no log, expected one or more, which are then written")
     # Drive an arm.
@@ -99,14 +92,14 @@ def _view(
     io = on.open(read.spec, tell)
     check_arm(io, Controller.of(read), f"--arm {on.arm}")
     hint = HINT if on.file == SHIPPED_TWIN else ""
-    setup = Setup(read, on.arm, at.host, at.port, hasattr(io, "attach"), demos is not None, hint)
+    setup = Setup(read, on.arm, host, port, hasattr(io, "attach"), demos is not None, hint)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
-    status = live(setup, io, tell, partial(_welcome, at.host), *saves).status
+    status = live(setup, io, tell, partial(_welcome, host), *saves).status
     finish(io, tell)
     return status
 
 
-def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Address) -> int:
+def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str, port: int) -> int:
     from mjx_softarm.view.replay import Timeline, replay, share
     from mjx_softarm.view.stage import open_server
 
@@ -115,8 +108,8 @@ def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Addres
         speed = share(html, spec, timelines)
         tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
         return 0
-    server = open_server(at.host, at.port, ", ".join(timeline.name for timeline in timelines))
-    tell(f"open http://{at.host}:{server.get_port()}; Ctrl-C ends")
+    server = open_server(host, port, ", ".join(timeline.name for timeline in timelines))
+    tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
     return replay(server, spec, timelines)
 
 

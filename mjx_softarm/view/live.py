@@ -165,8 +165,9 @@ class PagePilot:
             self.tell(self.demonstrations.take(state, row))
         self._doing = _doing(state, self._controller.policy.n_actions)
         self._goal = self._goal if state.goal is None else state.goal  # the last goal stays visible
-        spec = self._controller.policy.spec
-        look = look_at(row, state.belief.spring_m, spec, self._payload_kg)._replace(goal=self._goal)
+        policy = self._controller.policy
+        look = look_at(row, state.belief.spring_m, policy.spec, policy.tolerance_m, self._payload_kg)
+        look = look._replace(goal=self._goal)
         self._end.put(look=look, doing=self._doing, armed=self._armed, lines=tuple(self._said))
 
     def _carry(self, payload_kg: float) -> None:

@@ -21,6 +21,7 @@ class Look(NamedTuple):
     spring_m: np.ndarray  # (n_springs,)
     reference_m: np.ndarray  # (n_springs,)
     pressure_kpa: np.ndarray  # (n_chambers,)
+    saturated: np.ndarray  # (n_chambers,) bool, chambers at a limit whose springs are off their references
     estimate: np.ndarray  # (6,) [mm, deg] estimated tip pose
     goal: np.ndarray  # (6,) [mm, deg]
     seen: np.ndarray  # (6,) [mm, deg] tip pose from motion capture
@@ -38,36 +39,29 @@ class Look(NamedTuple):
         return float(np.linalg.norm(pose_error(pose, self.goal)[:3]))
 
 
-class Limits(NamedTuple):
-    """Limits of pressures and springs, for scales and marks."""
+def look_at(
+    row: Mapping[str, Any],
+    spring_m: np.ndarray,
+    spec: ArmSpec,
+    tolerance_m: float = TOLERANCE_M,
+    payload_kg: float = 0.0,
+) -> Look:
+    """Return the look of a row of the loop or of a log of an arm, with spring lengths (n_springs,) [m].
 
-    gains: Gains
-    spring_m: tuple[np.ndarray, np.ndarray]  # (n_springs,) each
-    tolerance_m: float  # largest error of a spring whose chamber, at a limit, is not saturated
-    n_sections: int
-
-    @classmethod
-    def of(cls, spec: ArmSpec, tolerance_m: float = TOLERANCE_M) -> Limits:
-        """Return an arm's limits, with the tolerance of its policy if that is known."""
-        lengths_m = spec.at_springs(spec.springs.length_min_m), spec.at_springs(spec.springs.length_max_m)
-        return cls(Gains.from_spec(spec), lengths_m, tolerance_m, spec.structure.n_sections)
-
-    def saturated(self, look: Look) -> np.ndarray:
-        """Mask (n_chambers,) the chambers at a limit whose springs are off their references."""
-        gains = self.gains.measured()
-        return saturated(look.pressure_kpa, look.reference_m, look.spring_m, gains, self.tolerance_m)
-
-
-def look_at(row: Mapping[str, Any], spring_m: np.ndarray, spec: ArmSpec, payload_kg: float = 0.0) -> Look:
-    """Return the look of a row of the loop or of a log of an arm, with spring lengths (n_springs,) [m]."""
+    A chamber at a limit is saturated where its spring is off by more than the tolerance.
+    """
     seen = pose = np.full(6, np.nan)
     if "tip_m" in row and "tip_quaternion" in row and np.isfinite(row["tip_quaternion"]).all():
         seen = pose_from_quaternion(row["tip_m"], row["tip_quaternion"])
+    reference_m = row.get("reference_m", np.full(spec.n_springs, np.nan))
+    pressure_kpa = row.get("pressure_kpa", np.full(spec.n_chambers, np.nan))
+    gains = Gains.from_spec(spec).measured()
     return Look(
         time_s=float(row["time_s"]),
         spring_m=spring_m,
-        reference_m=row.get("reference_m", np.full(spec.n_springs, np.nan)),
-        pressure_kpa=row.get("pressure_kpa", np.full(spec.n_chambers, np.nan)),
+        reference_m=reference_m,
+        pressure_kpa=pressure_kpa,
+        saturated=saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m),
         estimate=row.get("estimate", pose),
         goal=row.get("goal", pose),
         seen=seen,

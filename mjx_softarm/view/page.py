@@ -13,7 +13,7 @@ import viser
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
 from mjx_softarm.view.channel import ChannelEnd
-from mjx_softarm.view.look import Limits, Look
+from mjx_softarm.view.look import Look
 from mjx_softarm.view.panel import BLUE, MUTED, Panel, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
 
@@ -60,9 +60,8 @@ class Page:
         self._at = np.full(6, np.nan)  # pose that the gizmo shows
         # Picture of the arm.
         spec = setup.policy.spec
-        limits = Limits.of(spec, setup.policy.tolerance_m)
         set_the_scene(server, spec)
-        self._stage = Stage(server.scene, spec, limits)
+        self._stage = Stage(server.scene, spec)
         points = add_workspace(server.scene, setup.policy.workspace)
         look = {"scale": 0.15, "depth_test": False, "visible": False}
         self._gizmo = server.scene.add_transform_controls("/gizmo", **look)
@@ -70,7 +69,7 @@ class Page:
         icon, button = viser.Icon, self._button
         button("Stop", "hold", "Give up the goals, hold the arm where it is", icon.HAND_STOP, "orange")
         button("Vent", "vent", "Let the pressures go to zero; what it carries sinks", icon.WIND, "red")
-        self._panel = Panel(server.gui, limits, spec.n_chambers)
+        self._panel = Panel(server.gui, spec)
         with server.gui.add_folder("Move", order=0.5):
             button("Circle", "circle", "Go round the paper's circle, point by point", icon.CIRCLE)
             hint = "Fetch a mass on one side, put it down on the other, and back"

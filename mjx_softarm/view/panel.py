@@ -10,7 +10,8 @@ import numpy as np
 import viser
 from viser import uplot
 
-from mjx_softarm.view.look import Limits, Look
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.view.look import Look
 from mjx_softarm.view.stage import GOAL, SATURATED, SEEN, section_colours
 
 TRACE_S, TRACE_POINTS = 20.0, 200
@@ -21,22 +22,22 @@ BLUE, MUTED = "#2463a8", "#868e96"
 class Panel:
     """Text, bars and traces of one arm."""
 
-    def __init__(self, gui: viser.GuiApi, limits: Limits, n_chambers: int):
-        self._limits = limits
+    def __init__(self, gui: viser.GuiApi, spec: ArmSpec):
+        self._spec = spec
         self._text = gui.add_html("", order=0.2)  # below the buttons, above all else
         with gui.add_folder("Chambers and springs"):
             self._bars = gui.add_html("")
         with gui.add_folder("Traces"):
             lines = ("believed", css(GOAL)), ("seen", css(SEEN))
             self._errors = plot(gui, "tip error [mm], violet: seen", lines)
-            colours = section_colours(n_chambers, limits.n_sections)
+            colours = section_colours(spec, spec.n_chambers)
             lines = [(f"chamber {k}", css(colour)) for k, colour in enumerate(colours)]
             self._pressures = plot(gui, "pressures [kPa]", lines)
         self._trace: deque[tuple] = deque(maxlen=TRACE_POINTS)
 
     def show_bars(self, look: Look) -> None:
         """Draw the bars of a moment."""
-        self._bars.content = bars(look, self._limits)
+        self._bars.content = bars(look, self._spec)
 
     def show_traces(self, look: Look) -> None:
         """Add a moment to the traces; an earlier moment than the last clears them."""
@@ -69,31 +70,31 @@ class Panel:
         )
 
 
-def bars(look: Look, limits: Limits) -> str:
+def bars(look: Look, spec: ArmSpec) -> str:
     """Return bars of pressures between their limits, and of springs beside their references, as HTML."""
-    saturated, zero = limits.saturated(look), np.zeros(len(look.pressure_kpa))
-    low_kpa, high_kpa = zero + limits.gains.pressure_min_kpa, zero + limits.gains.pressure_max_kpa
-    beside = saturated[:: len(saturated) // len(look.spring_m)]  # chambers that have a spring beside them
-    springs = limits.spring_m[0], look.spring_m, look.reference_m
+    limits_kpa = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    limits_m = spec.at_springs(spec.springs.length_min_m), spec.at_springs(spec.springs.length_max_m)
+    zero = np.zeros(spec.n_chambers)
+    beside = look.saturated[:: spec.n_chambers // spec.n_springs]  # chambers that have a spring beside them
     # Words below the bars, and a note about saturated chambers.
     kpa = [f"{p:.0f}" for p in look.pressure_kpa]
     off = [f"{1e3 * (a - b):+.1f}" for a, b in zip(look.spring_m, look.reference_m, strict=True)]
-    names = ", ".join(map(str, np.flatnonzero(saturated)))
+    names = ", ".join(map(str, np.flatnonzero(look.saturated)))
     note = f"saturated: chamber {names}" if names else "no chamber saturated"
     line = "<div style='padding:0.2em 1em;font-size:11px;color:{}'>{}</div>"
-    colours = [section_colours(len(mask), limits.n_sections) for mask in (saturated, beside)]
+    colours = [section_colours(spec, n) for n in (spec.n_chambers, spec.n_springs)]
     return (
-        line.format(MUTED, f"pressures, {low_kpa.min():g} to {high_kpa.max():g} kPa")
-        + _bars((zero, look.pressure_kpa, zero), (low_kpa, high_kpa), saturated, kpa, colours[0])
+        line.format(MUTED, "pressures, {:g} to {:g} kPa".format(*limits_kpa))
+        + _bars((zero, look.pressure_kpa, zero), limits_kpa, look.saturated, kpa, colours[0])
         + line.format(MUTED, "springs beside their references, off by mm")
-        + _bars(springs, limits.spring_m, beside, off, colours[1])
+        + _bars((limits_m[0], look.spring_m, look.reference_m), limits_m, beside, off, colours[1])
         + line.format(css(SATURATED) if names else MUTED, note)
     )
 
 
 def _bars(
     levels: tuple[np.ndarray, np.ndarray, np.ndarray],
-    limits: tuple[np.ndarray, np.ndarray],
+    limits: tuple[np.ndarray, np.ndarray] | tuple[float, float],
     warned: np.ndarray,
     words: Sequence[str],
     colours: Sequence[tuple[int, int, int]],

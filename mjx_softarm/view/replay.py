@@ -16,7 +16,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.checks import late_rows
 from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.view.look import Limits, Look, looks
+from mjx_softarm.view.look import Look, looks
 from mjx_softarm.view.panel import BLUE, Panel
 from mjx_softarm.view.stage import Stage, open_server, set_the_scene
 
@@ -65,7 +65,7 @@ class ReplayPage:
         self._panels = []
         for timeline in timelines:
             with gui.add_folder(timeline.name):
-                self._panels.append(Panel(gui, Limits.of(spec), spec.n_chambers))
+                self._panels.append(Panel(gui, spec))
         self._shown_s, self._end_s = -1.0, end_s
 
     def refresh(self, passed_s: float) -> None:
@@ -120,7 +120,7 @@ def _stages(server: viser.ViserServer, spec: ArmSpec, timelines: Sequence[Timeli
     set_the_scene(server, spec, APART_M * (len(timelines) - 1))
     stages = []
     for k, timeline in enumerate(timelines):
-        stages.append(Stage(server.scene, spec, Limits.of(spec), f"/arm{k}", (0.0, k * APART_M, 0.0)))
+        stages.append(Stage(server.scene, spec, f"/arm{k}", (0.0, k * APART_M, 0.0)))
         stages[-1].show_path(timeline.path_m)
         server.scene.add_label(f"/arm{k}/name", timeline.name, position=(0.0, 0.0, 0.09))
     return stages

@@ -26,7 +26,7 @@ from mjx_softarm.mechanics.body import (
 from mjx_softarm.posture import base_rotation, posture
 from mjx_softarm.sensing.pose import quaternion_from_pose, quaternion_from_rotation
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.view.look import Limits, Look
+from mjx_softarm.view.look import Look
 
 SECTION_COLOURS = ((214, 90, 66), (235, 172, 70), (70, 140, 200))  # as in MuJoCo's pictures
 SATURATED, GOAL, SEEN = (226, 38, 77), (40, 160, 96), (124, 77, 210)
@@ -42,7 +42,6 @@ class Stage:
     Args:
         scene: scene of the server.
         spec: the arm.
-        limits: limits by which chambers are marked as saturated.
         name: name of the arm's node.
         place_m: (3,) place of the arm's base.
     """
@@ -51,11 +50,10 @@ class Stage:
         self,
         scene: viser.SceneApi,
         spec: ArmSpec,
-        limits: Limits,
         name: str = "/arm",
         place_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ):
-        self._spec, self._limits = spec, limits
+        self._spec = spec
         self._trail: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
         self._marked: np.ndarray | None = None  # (n_chambers,) bool, chambers drawn as saturated
         scene.add_frame(name, show_axes=False, position=place_m)
@@ -106,7 +104,7 @@ class Stage:
         for handle, copies in ((self._rings, now.rings), (self._folds, now.folds), (self._coils, now.coils)):
             handle.batched_positions, handle.batched_wxyzs = copies.position_m, copies.quaternion
             handle.batched_scales = copies.scales
-        self._mark(self._limits.saturated(look))
+        self._mark(look.saturated)
         self._tip.position, self._tip.wxyz = now.rings.position_m[-1], now.rings.quaternion[-1]
         self._payload.visible = look.payload_kg > 0.0
         self._payload.scale = payload_radius_m(look.payload_kg)
@@ -132,7 +130,7 @@ class Stage:
         """Colour the bellows; send a message only if the colours change."""
         if self._marked is None or not np.array_equal(saturated, self._marked):
             self._marked = saturated
-            colours = np.array(section_colours(len(saturated), self._limits.n_sections))
+            colours = np.array(section_colours(self._spec, len(saturated)))
             colour = np.where(saturated[:, None], SATURATED, colours).astype(np.uint8)
             self._folds.batched_colors = np.repeat(colour, FOLDS, axis=0)
 
@@ -173,9 +171,9 @@ def _gripper(spec: ArmSpec) -> trimesh.Trimesh:
     return trimesh.util.concatenate(boxes)  # pyright: ignore[reportReturnType]
 
 
-def section_colours(n: int, n_sections: int) -> list[tuple[int, int, int]]:
+def section_colours(spec: ArmSpec, n: int) -> list[tuple[int, int, int]]:
     """Return the colours of n chambers or springs, by their sections."""
-    return [SECTION_COLOURS[k * n_sections // n % len(SECTION_COLOURS)] for k in range(n)]
+    return [SECTION_COLOURS[k * spec.structure.n_sections // n % len(SECTION_COLOURS)] for k in range(n)]
 
 
 def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> viser.SceneNodeHandle:

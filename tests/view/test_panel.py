@@ -7,7 +7,7 @@ import pytest
 
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.view.look import Limits, look_at, looks
+from mjx_softarm.view.look import look_at, looks
 from tests.linear_arm import HIGH_KPA, REST_M, SENSOR, SPEC, N
 
 
@@ -21,14 +21,14 @@ def test_saturated_chambers_are_found_and_marked(panel):
     kpa[[2, 7]] = HIGH_KPA - 0.1  # as measured
     reference_m[2] += 0.01  # chamber 7 is on its reference
     row = {"time_s": 0.0, "pressure_kpa": kpa, "reference_m": reference_m}
-    look, limits = look_at(row, np.full(N, REST_M), SPEC), Limits.of(SPEC)
-    assert np.flatnonzero(limits.saturated(look)).tolist() == [2]
-    assert not Limits.of(SPEC, tolerance_m=0.02).saturated(look).any()
-    drawn = panel.bars(look, limits)
+    look = look_at(row, np.full(N, REST_M), SPEC)
+    assert np.flatnonzero(look.saturated).tolist() == [2]
+    assert not look_at(row, np.full(N, REST_M), SPEC, tolerance_m=0.02).saturated.any()
+    drawn = panel.bars(look, SPEC)
     assert "saturated: chamber 2<" in drawn and drawn.count(panel.css((226, 38, 77))) == 3
     assert "-10.0</text>" in drawn
     nothing = look_at({"time_s": 0.0}, np.full(N, np.nan), SPEC)
-    assert "nan" not in panel.bars(nothing, limits)
+    assert "nan" not in panel.bars(nothing, SPEC)
 
 
 def test_the_payload_that_the_loop_believes_is_told(panel):
