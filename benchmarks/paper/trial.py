@@ -109,12 +109,12 @@ def operate(
     # Watch the twin's contact forces and its gripper.
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces_n: list[float] = []
-    force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
+    force = getattr(twin, "wall_force_n", lambda: 0.0)  # a rod touches nothing
     gripper = Gripper(twin, names, finger_tips(*frame_from_pose(goals), gripper_m), trial.objects, gripper_m)
 
     def note() -> None:
         """Note the wall's force of a control period, and let a floor carry what is held."""
-        forces_n.append(force()[0])
+        forces_n.append(force())
         gripper.hang()
 
     watch(twin, note)

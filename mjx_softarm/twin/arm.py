@@ -39,7 +39,7 @@ from mjx_softarm.twin.instruments import (
     InstrumentedArm,
 )
 from mjx_softarm.twin.model import build_twin, draw_parts
-from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
+from mjx_softarm.twin.pipe import contact_force_n, is_wall
 
 # Losses of the paper's arm.
 # Chambers: four stops of equal force; together 3 % of the elastic force of the shortest chamber.
@@ -108,8 +108,8 @@ class Twin(InstrumentedArm):
         self._pipe = pipe
         self._model = build_twin(self._parts, pipe)
         self._data = mujoco.MjData(self._model)
-        self._container = is_container(self._model)
-        self._wall_force = WallForce(0.0, 0.0)
+        self._wall = is_wall(self._model)
+        self._wall_force_n = 0.0
         self._base_m = self._parts.base_position_m
         self._base_rotation = self._parts.base_rotation
         # Start clock, losses and air.
@@ -157,7 +157,7 @@ class Twin(InstrumentedArm):
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
         self._air.command(self._commands(pressure_kpa, self._parts.spec))
-        self._wall_force = WallForce(0.0, 0.0)
+        self._wall_force_n = 0.0
         for _ in range(self._steps):
             self._step()
         if self._data.warning.number.any():  # MuJoCo would reset the state by itself
@@ -197,9 +197,9 @@ class Twin(InstrumentedArm):
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
         mujoco.mj_step1(self._model, self._data)
 
-    def wall_force_n(self) -> WallForce:
-        """Return the largest contact forces [N] in the last control period; zeros without a pipe."""
-        return self._wall_force
+    def wall_force_n(self) -> float:
+        """Return the walls' largest contact force [N] in the last control period; 0 without a pipe."""
+        return self._wall_force_n
 
     def renderer(self, width: int, height: int) -> Any:
         """Return a `mjx_softarm.mechanics.drawing.render.Renderer` of this twin, for `draw`.
@@ -235,6 +235,5 @@ class Twin(InstrumentedArm):
         data.qfrc_applied[:] = -self._friction.move(data.qpos)
         mujoco.mj_step2(self._model, data)
         if self._pipe is not None:
-            force = contact_force(data, self._container)
-            self._wall_force = WallForce(*map(max, self._wall_force, force))
+            self._wall_force_n = max(self._wall_force_n, contact_force_n(data, self._wall))
         mujoco.mj_step1(self._model, data)

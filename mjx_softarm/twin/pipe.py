@@ -1,4 +1,4 @@
-"""The pipe around the twin: walls and containers, and the forces of their contacts with rings and gripper.
+"""The pipe around the twin: walls and containers, and the force of the walls on rings and gripper.
 
 Walls are planks: the sides of a prism around each of the two cylinders. At their intersection both walls
 end at |z - centre| = |x|, because at the same y both are equally far from their axes. The prisms lie
@@ -12,7 +12,6 @@ the last rings are rounded rims instead. The arm touches the pipe, never itself.
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -45,13 +44,6 @@ _CONTAINER_COLOURS = {
     "right": [0.90, 0.55, 0.20, 1.0],
     "bottom": [0.35, 0.65, 0.35, 1.0],
 }
-
-
-class WallForce(NamedTuple):
-    """Sums of normal contact forces."""
-
-    wall: float  # [N]
-    container: float  # [N]
 
 
 def add_pipe(
@@ -144,17 +136,13 @@ def _make_solid(geom: mujoco.MjsGeom, contype: int, conaffinity: int) -> None:
     geom.solref, geom.solimp = [TIME_CONSTANT_S, 1.0], IMPEDANCE
 
 
-def is_container(model: mujoco.MjModel) -> np.ndarray:
-    """Mask (ngeom,) the geometries of containers."""
-    return np.array([model.geom(k).name.startswith(CONTAINER) for k in range(model.ngeom)])
+def is_wall(model: mujoco.MjModel) -> np.ndarray:
+    """Mask (ngeom,) the geometries of walls."""
+    return np.array([model.geom(k).name.startswith(WALL) for k in range(model.ngeom)])
 
 
-def contact_force(data: mujoco.MjData, container: np.ndarray) -> WallForce:
-    """Return the contact forces of the last time step; `container` is from `is_container`."""
-    if data.ncon == 0:
-        return WallForce(0.0, 0.0)
+def contact_force_n(data: mujoco.MjData, wall: np.ndarray) -> float:
+    """Return the sum of the walls' normal forces [N] in the last time step; `wall` is from `is_wall`."""
     contact = data.contact
-    active = contact.efc_address >= 0
-    force_n = np.where(active, data.efc_force[contact.efc_address], 0.0) if data.nefc else np.zeros(data.ncon)
-    in_container = container[contact.geom].any(axis=1)
-    return WallForce(float(force_n[~in_container].sum()), float(force_n[in_container].sum()))
+    touched = wall[contact.geom].any(axis=1) & (contact.efc_address >= 0)
+    return float(data.efc_force[contact.efc_address[touched]].sum())
