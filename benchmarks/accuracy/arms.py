@@ -81,7 +81,6 @@ class Case(NamedTuple):
 class ArmSettings(NamedTuple):
     """Size of the measurement."""
 
-    preset: str
     steps: int | None
     points: int
     goals: tuple[str, ...]
@@ -91,7 +90,6 @@ def measure(
     arms: Annotated[tuple[str, ...], names_of(ARMS)] = KINDS,
     seeds: cli.Integers = (0,),
     poses: cli.Integers = (300,),
-    preset: str = "analytic",
     steps: int | None = None,
     points: int = 40,
     goals: Annotated[tuple[str, ...], names_of(GOALS)] = GOALS,
@@ -104,7 +102,6 @@ def measure(
             SoRoMoX's environment
         seeds: of the stand-ins
         poses: random poses of each recording, which ends earlier where more bring nothing
-        preset: of each training
         steps: environment steps of each training; None: the preset's
         points: goals of the circle, and of the grid at most
         goals: circle, or circle and grid
@@ -112,11 +109,11 @@ def measure(
     """
     if "circle" not in goals:
         raise InputError(f"--goals: got {','.join(goals)}, expected circle among them")
-    settings, out = ArmSettings(preset, steps, points, goals), keep.absolute()
+    settings, out = ArmSettings(steps, points, goals), keep.absolute()
     claim(out, settings._asdict())
     cases = [Case(*case) for case in itertools.product(arms, seeds, poses)]
     stages = [
-        WorkStage(case.folder, tuple(f"{case.folder}/{name}/{ACCURACY}" for name in goals), take, (case,))
+        WorkStage(tuple(f"{case.folder}/{name}/{ACCURACY}" for name in goals), take, (case,))
         for case in cases
     ]
     run_stages(out, settings, [stages])
@@ -150,7 +147,7 @@ def take(out: Path, settings: ArmSettings, case: Case) -> None:
     ensure(calibration / "report.json", "calib", "run", log, "--spec", file, "--out", calibration)
     steps = ("--learner.total-env-steps", settings.steps) if settings.steps else ()
     if not (run / EVALUATION_FILE).exists():
-        train(run, "reach", "--preset", settings.preset, "--calibration", calibration, *steps)
+        train(run, "reach", "--preset", "analytic", "--calibration", calibration, *steps)
     ensure(run / "policy.npz", "train", "export", run)
 
     # Measure the policy on its arm

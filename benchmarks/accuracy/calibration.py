@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import itertools
 import tempfile
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,14 +77,16 @@ def _worst(fitted: Any, true: Any) -> float:
 
 def real_logs(data: Path) -> dict[str, Any]:
     """Return errors of calibrated lines, the sim-to-real network and regulators on logs of real arms."""
-    splits = {
-        f"a fifth of the blocks, seed {seed}": trunk_errors(data, "1", partial(held_out_blocks, seed=seed))
-        for seed in SEEDS
-    }
-    splits["another day"] = trunk_across(data, "1", "11")
+    day, other_day = (read_trunk(data / TRUNK_LOG.format(number)) for number in (1, 11))
+    trunk = []
+    for seed in SEEDS:
+        out = held_out_blocks(len(day.fresh), seed=seed)
+        trunk.append({"held out": f"a fifth of the blocks, seed {seed}", **trunk_errors([day], out)})
+    out = np.repeat([False, True], [len(day.fresh), len(other_day.fresh)])
+    trunk.append({"held out": "another day", **trunk_errors([day, other_day], out)})
     return {
         "draw wires to section length at rest, RMS": {name: wires_error(data, name) for name in ASU_LOGS},
-        "trunk, 3D RMSE": [{"held out": name, **errors} for name, errors in splits.items()],
+        "trunk, 3D RMSE": trunk,
         "pressures of another day, RMS [psi]": regulators_errors(data),
     }
 
@@ -133,29 +134,15 @@ def still_rows(time_s: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (np.abs(x - before) < STILL_M) & (np.abs(after - x) < STILL_M)
 
 
-def trunk_errors(data: Path, log: str, held_out: Callable[[int], np.ndarray]) -> dict[str, float]:
-    """Return tip errors on fresh held-out rows; motor angles replace springs, a line the simulator."""
-    x, tip_mm, fresh = _trunk(data, log)
-    out = held_out(len(x))
-    return _trunk_errors(x, tip_mm, ~out & fresh, out & fresh)
+def trunk_errors(logs: Sequence[TrunkLog], held_out: np.ndarray) -> dict[str, float]:
+    """Return tip errors [mm] on the held-out rows (n,) of all logs, of fits to the others; fresh rows count.
 
-
-def trunk_across(data: Path, fitted: str, asked: str) -> dict[str, float]:
-    """Return tip errors on the fresh rows of a log, of fits to another log."""
-    parts = [_trunk(data, name) for name in (fitted, asked)]
-    x, tip_mm, fresh = (np.concatenate(column) for column in zip(*parts, strict=True))
-    train = np.arange(len(x)) < len(parts[0][0])
-    return _trunk_errors(x, tip_mm, train & fresh, ~train & fresh)
-
-
-def _trunk(data: Path, log: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return motor angles (n, 6) [deg], tips (n, 3) [mm], and whether they are fresh (n,)."""
-    trunk = read_trunk(data / TRUNK_LOG.format(log))
-    return motor_angles(trunk.motor_deg), 1e3 * trunk.tip_m, trunk.fresh
-
-
-def _trunk_errors(x: np.ndarray, tip_mm: np.ndarray, train: np.ndarray, test: np.ndarray) -> dict[str, float]:
-    """Return errors on rows `test` (n,) of polynomials and the mean network, fitted to rows `train` (n,)."""
+    Motor angles replace springs, and a polynomial the simulator.
+    """
+    x = np.concatenate([motor_angles(log.motor_deg) for log in logs])
+    tip_mm = 1e3 * np.concatenate([log.tip_m for log in logs])
+    fresh = np.concatenate([log.fresh for log in logs])
+    train, test = fresh & ~held_out, fresh & held_out
     linear, cubic = (polynomial(x, tip_mm, train, degree) for degree in (1, 3))
     fits = [fit_network(x[train], (tip_mm - linear)[train], seed) for seed in range(N_NETWORKS)]
     network = linear + np.mean([correction(fit.network, x) for fit in fits], axis=0)

@@ -73,9 +73,9 @@ def measure(
     claim(out, {"env_steps": env_steps})
     runs = {name: seeds[:1] if CASES[name].one_seed else seeds for name in cases}
     tasks = dict.fromkeys(CASES[name].task for name in cases)
-    demonstrated = [WorkStage(f"demonstrate {t}", (_demos_file(t),), demonstrate, (t,)) for t in tasks]
+    demonstrated = [WorkStage((_demos_file(t),), demonstrate, (t,)) for t in tasks]
     trained = [
-        WorkStage(f"{name}, seed {n}", (f"{_run_name(name, n)}/{EVALUATION_FILE}",), imitate, (name, n))
+        WorkStage((f"{_run_name(name, n)}/{EVALUATION_FILE}",), imitate, (name, n))
         for name in cases
         for n in runs[name]
     ]

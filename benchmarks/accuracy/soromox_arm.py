@@ -150,10 +150,7 @@ class SoromoxRod:
 def fibre_energy(stretch: Array, pressure_kpa: Array, parts: RodParts) -> Array:
     """Return the energy (s, per_section, c + k) [J] of fibres in segments, each as if it were a section.
 
-    Args:
-        stretch (s, per_section, c + k): lengths, divided by that of the segment.
-        pressure_kpa (s, c) [kPa]: pressures.
-        parts: numbers of the rod.
+    `stretch` has their lengths, divided by that of the segment; pressures are (s, c).
     """
     # Chambers, which harden, and the work of their pressures
     full_m, n_chambers = parts.section_length_m[:, None, None], parts.stiffness.shape[1]

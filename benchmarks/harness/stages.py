@@ -29,7 +29,6 @@ DONE = (0, 1)  # exit statuses of a command that wrote its results; 1: they miss
 class WorkStage(NamedTuple):
     """A function of the folder, the settings and some inputs; it is done once its results exist."""
 
-    name: str
     results: tuple[str, ...]  # paths in the folder
     function: Callable[..., None]
     inputs: tuple[Any, ...] = ()
@@ -77,8 +76,8 @@ def run_stages(folder: Path, settings: Any, groups: Sequence[Sequence[WorkStage]
                         raise InputError(f"got no {', '.join(missing)} in {folder}, expected its results")
                 except Exception as error:
                     pool.shutdown(cancel_futures=True)
-                    raise InputError(f"{stage.name}: {type(error).__name__}: {error}") from error
-                print(f"{n_done} of {len(pending)}: {stage.name}", flush=True)
+                    raise InputError(f"{stage.results[0]}: {type(error).__name__}: {error}") from error
+                print(f"{n_done} of {len(pending)}: {stage.results[0]}", flush=True)
 
 
 def _prepare_worker(shares: Any) -> None:

@@ -127,24 +127,12 @@ def paper(
 def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
     """Return the stages of an experiment, group by group."""
     if experiment == "independence":
-        measured = itertools.product((*independence.POLICIES, independence.SOLVER), settings.seeds)
-        return [[_measure(name, seed) for name, seed in measured]]
-    calibrated = [
-        WorkStage(f"calibrate twin {t}", (f"twin{t}/{CALIBRATION}",), calibrate_twin, (t,))
-        for t in settings.twins
-    ]
+        keys = itertools.product((*independence.POLICIES, independence.SOLVER), settings.seeds)
+        return [[WorkStage((independence.result(*key),), independence.measure, key) for key in keys]]
+    calibrated = [WorkStage((f"twin{t}/{CALIBRATION}",), calibrate_twin, (t,)) for t in settings.twins]
     learned = _open_stages(settings) if experiment == "open" else _confined_stages(settings)
-    return [calibrated, *learned, [_try(trial) for trial in trials(experiment, settings)]]
-
-
-def _measure(name: str, seed: int) -> WorkStage:
-    result = independence.result(name, seed)
-    return WorkStage(f"{name}, seed {seed}", (result,), independence.measure, (name, seed))
-
-
-def _try(trial: Trial) -> WorkStage:
-    name = f"try {trial.kind}, twin {trial.twin}, seed {trial.seed}, {trial.variant}"
-    return WorkStage(name, (trial.result,), try_out, (trial,))
+    tried = [WorkStage((trial.result,), try_out, (trial,)) for trial in trials(experiment, settings)]
+    return [calibrated, *learned, tried]
 
 
 def _open_stages(settings: Settings) -> list[list[WorkStage]]:
@@ -160,10 +148,7 @@ def _confined_stages(settings: Settings) -> list[list[WorkStage]]:
     keys = [(kind, *run) for kind in PIPE_KINDS for run in settings.runs]
     tasks = dict.fromkeys((twin, KINDS[kind].task) for kind, twin, _ in keys)
     return [
-        [
-            WorkStage(f"{task}, twin {twin}", (demonstrations_path(twin, task),), demonstrate, (twin, task))
-            for twin, task in tasks
-        ],
+        [WorkStage((demonstrations_path(*key),), demonstrate, key) for key in tasks],
         [_learn(imitate, *key) for key in keys if not KINDS[key[0]].reward_of],
         [_learn(imitate, *key) for key in keys if KINDS[key[0]].reward_of],
         [_export(twin, keys) for twin in settings.twins],
@@ -171,13 +156,12 @@ def _confined_stages(settings: Settings) -> list[list[WorkStage]]:
 
 
 def _learn(job: Callable[..., None], kind: str, twin: int | None, seed: int) -> WorkStage:
-    result = f"{run_path(kind, twin, seed)}/{EVALUATION_FILE}"
-    return WorkStage(f"train {kind}, {arm_name(twin)}, seed {seed}", (result,), job, (kind, twin, seed))
+    return WorkStage((f"{run_path(kind, twin, seed)}/{EVALUATION_FILE}",), job, (kind, twin, seed))
 
 
 def _export(twin: int | None, keys: Iterable[tuple[str, int | None, int]]) -> WorkStage:
     policies = tuple(f"{run_path(*key)}/{POLICY_FILE}" for key in keys if key[1] == twin)
-    return WorkStage(f"export for {arm_name(twin)}", policies, export, (twin, policies))
+    return WorkStage(policies, export, (twin, policies))
 
 
 def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,9 +45,6 @@ TARGETS = (
     PeerTarget("sb3-contrib-hindsight", 15.0),
     PeerTarget("sbx-hindsight", 20.0, "ours-analytic"),
 )
-
-Result = Mapping[str, Any]  # of a contestant with a seed
-Point = Mapping[str, Any]  # of a curve: wall_s, trained_s, env_steps, updates, median_mm (None if not finite)
 
 
 class RaceLimits(NamedTuple):
@@ -87,17 +84,17 @@ def run(folder: Path, seed: int) -> list[Facts]:
             continue
         limits = limits_of(name, [result for result in results if result["contestant"].startswith("ours")])
         program = ["benchmarks.race.contestants", name, str(seed), str(limits.stretch_s), str(N_GOALS)]
-        results.append({"contestant": name, "seed": seed})
+        result = {"contestant": name, "seed": seed}
         try:
             python = None if ours else peer_python(library_of(name))
-            results[-1] |= train(Worker(who, program, python), limits)
+            result |= train(Worker(who, program, python), limits)
+            write_json(file, result)
         except InputError as error:
             if ours:
                 raise
             print(f"{who}: failed: {error}")
-            results[-1]["failed"] = str(error)
-            continue
-        write_json(file, results[-1])
+            result["failed"] = str(error)
+        results.append(result)
     return results
 
 
@@ -119,7 +116,10 @@ def limits_of(name: str, ours: Sequence[Facts]) -> RaceLimits:
 
 
 def train(worker: Worker, limits: RaceLimits) -> dict[str, Any]:
-    """Let a contestant train until its end or a limit; returns start-up time, time limit and curve."""
+    """Let a contestant train until its end or a limit; returns start-up time, time limit and curve.
+
+    A point of the curve has wall_s, trained_s, env_steps, updates and median_mm, None if it is not finite.
+    """
     limit_s = limits.wall_s if math.isfinite(limits.wall_s) else None
     print(f"{worker.name}: up to {limits.wall_s:.0f} s, evaluations not counted ...", flush=True)
     points: list[Facts] = []
@@ -137,7 +137,7 @@ def train(worker: Worker, limits: RaceLimits) -> dict[str, Any]:
     return {"start_up_s": worker.facts["start_up_s"], "limit_s": limit_s, "points": points}
 
 
-def crossing(points: Sequence[Point], level_mm: float, axis: str) -> float | None:
+def crossing(points: Sequence[Facts], level_mm: float, axis: str) -> float | None:
     """Return where on an axis a curve first comes down to a level, linearly between evaluations, or None."""
     before = None
     for point in points:
@@ -151,12 +151,12 @@ def crossing(points: Sequence[Point], level_mm: float, axis: str) -> float | Non
     return None
 
 
-def median_mm(point: Point) -> float:
+def median_mm(point: Facts) -> float:
     """Return the median tip error; infinite where it was not finite."""
     return math.inf if point["median_mm"] is None else point["median_mm"]
 
 
-def summarise(results: Sequence[Result]) -> dict[str, Any]:
+def summarise(results: Sequence[Facts]) -> dict[str, Any]:
     """Return times to each level with start-up and without, targets, failures and the curves."""
     ran = [result for result in results if "points" in result]
     return {
@@ -168,7 +168,7 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
     }
 
 
-def _row(result: Result, axis: str) -> dict[str, Any]:
+def _row(result: Facts, axis: str) -> dict[str, Any]:
     """Return a contestant's time to each level; for a missed level, the time that it had."""
     points = result["points"]
     last = points[-1][axis]
@@ -179,7 +179,7 @@ def _row(result: Result, axis: str) -> dict[str, Any]:
     return row | {"best_mm": round(min(map(median_mm, points)), 2), "in_all": round(last)}
 
 
-def judge(wanted: PeerTarget, results: Sequence[Result]) -> dict[str, str]:
+def judge(wanted: PeerTarget, results: Sequence[Facts]) -> dict[str, str]:
     """Judge how many times our wall time a peer takes, median over seeds.
 
     One that was stopped before the level counts with the time that it had, which may show nothing.

@@ -44,11 +44,7 @@ class RestDetector:
             return np.ones(len(length_m), bool)
         if self._tick < len(self._past_m):
             return np.zeros(len(length_m), bool)
-        oldest_m = self._past_m[self._tick % len(self._past_m), arms]
-        done = np.abs(length_m - oldest_m).max(axis=-1) <= REST_M
-        if done.any():  # only then is the whole past worth its time
-            done[done] = np.ptp(self._past_m[:, arms[done]], axis=0).max(axis=-1) <= REST_M
-        return done
+        return np.ptp(self._past_m[:, arms], axis=0).max(axis=-1) <= REST_M
 
 
 class SteppedArms:

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from benchmarks.harness.rounds import n_cores
 from benchmarks.speed.jax_worker import Program, digits, mesh_of, of_shares, rates, split_cpu, spread
 from benchmarks.speed.mujoco_arms import SteppedArms
-from benchmarks.speed.truth import Truth, error_figures, random_references, settle_function, true_rest
+from benchmarks.speed.truth import error_figures, random_references, settle_function, true_rest
 from mjx_softarm._support import xla
 from mjx_softarm.spec import ArmSpec
 
@@ -58,10 +58,8 @@ def methods_rows(links: int, mesh: Mesh) -> list[dict[str, Any]]:
         if name not in tips_mm:
             rows.append({**row, "skipped": NO_MJX})
             continue
-        n = len(tips_mm[name])
-        first = Truth(truth.tip_mm[:n], truth.settled[:n], truth.share_at_limit)
         rate = digits(float(np.median([rates[name] for rates in rounds])))
-        rows.append({**row, **error_figures(tips_mm[name], first), "solves_per_s": rate})
+        rows.append({**row, **error_figures(tips_mm[name], truth), "solves_per_s": rate})
     return rows
 
 

@@ -53,10 +53,12 @@ def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
 
 
 def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
-    """Return quantiles of the distance of tips (n, 3) [mm] from their equilibria, where those are known."""
-    error = np.linalg.norm(np.asarray(tip_mm, np.float64) - truth.tip_mm, axis=-1)[truth.settled]
+    """Return quantiles of the distance of the first n tips (n, 3) [mm] from their equilibria, where known."""
+    n = len(tip_mm)
+    settled = truth.settled[:n]
+    error = np.linalg.norm(np.asarray(tip_mm, np.float64) - truth.tip_mm[:n], axis=-1)[settled]
     errors = {name: float(f"{np.quantile(error, share):.3g}") for name, share in QUANTILES.items()}
-    return {**errors, "without_truth": int(np.sum(~truth.settled))}
+    return {**errors, "without_truth": int(np.sum(~settled))}
 
 
 def reported_error(spec: ArmSpec, answers: Sequence[Mapping[str, Any]]) -> dict[str, float]:

@@ -54,13 +54,7 @@ def check(golden: Golden, path: Path) -> Agreement:
 
 
 def compare(golden: Golden, rows: np.ndarray, outputs: dict[str, np.ndarray]) -> Agreement:
-    """Compare outputs with the outputs of some golden rows.
-
-    Args:
-        golden: golden rows.
-        rows (k,): indices of the answered rows.
-        outputs: arrays (k,) by the names of their columns.
-    """
+    """Compare outputs (k,), by the names of their columns, with those of the golden rows `rows` (k,)."""
     names = golden.output_columns()
     worst = Agreement(len(rows), 0.0, "none", 0)
     for name, got in outputs.items():
@@ -118,9 +112,8 @@ def _by_onnx(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarr
 def without_memory(golden: Golden, answer: Callable) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the golden rows that depend only on readings and goal, and their outputs by column.
 
-    Args:
-        golden: golden rows.
-        answer: readings (n_springs,) and goal (6,), float32 -> outputs of `computations.answer`.
+    `answer` takes readings (n_springs,) and a goal (6,), float32, and gives the outputs of
+    `computations.answer`.
     """
     rows = np.flatnonzero(golden.inputs[:, FLAGS.index("restart")] > golden.inputs[:, FLAGS.index("checked")])
     answers = []

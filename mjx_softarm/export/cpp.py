@@ -119,11 +119,7 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
 
 
 class Numbers:
-    """Constant arrays of all functions, each once.
-
-    Args:
-        names: arrays with names; arrays without a name are numbered.
-    """
+    """Constant arrays of all functions, each once; arrays that have no name are numbered."""
 
     def __init__(self, names: Mapping[str, np.ndarray]):
         self._known = {_key(array): name.replace(".", "_") for name, array in names.items()}
@@ -175,7 +171,7 @@ class _Body:
 
     def _read_once(self, item: Symbol) -> bool:
         """Return whether an operation can be written into the expression that reads its result."""
-        if item.op not in _EXPRESSIONS | {"cast": ""} and item.op not in _VIEWS:
+        if item.op not in (*_EXPRESSIONS, "cast", *_VIEWS):
             return False
         if len(self._readers[item]) != 1:
             return False

@@ -34,13 +34,10 @@ _TYPES = {"f": TensorProto.FLOAT, "i": TensorProto.INT32, "b": TensorProto.BOOL}
 
 
 def write_onnx(path: Path, computation: Computation, about: Mapping[str, Any], defaults: Mapping) -> None:
-    """Write a computation as one graph.
+    """Write a computation as one graph, whose inputs are float32.
 
-    Args:
-        path: the file.
-        computation: recorded computation; its inputs become float32.
-        about: description for the metadata, in types that JSON has.
-        defaults: values of optional inputs, by name.
+    `about` is the description for the metadata, in types that JSON has; `defaults` are the values of optional
+    inputs, by name.
     """
     # Nodes and tensors.
     writer = _Writer()

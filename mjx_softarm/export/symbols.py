@@ -93,7 +93,7 @@ class Repeat(NamedTuple):
 
 def _operator(name: str, swapped: bool = False) -> Callable[[Symbol, Any], Symbol]:
     def operate(self: Symbol, other: Any) -> Symbol:
-        return _NAMESPACE[name](*((other, self) if swapped else (self, other)))
+        return getattr(_NAMESPACE, name)(*((other, self) if swapped else (self, other)))
 
     return operate
 
@@ -217,9 +217,6 @@ _OWN = {
 
 class _Namespace:
     """NumPy's functions on symbols; without symbols they are NumPy's own."""
-
-    def __getitem__(self, name: str) -> Callable[..., Any]:
-        return getattr(self, name)
 
     def __getattr__(self, name: str) -> Any:
         plain = getattr(np, name)

@@ -1,8 +1,7 @@
 """The twin: a simulated arm in place of a real one, reached only through `ArmIO` and logs.
 
-Its model is finer than training's: inexact parts, chambers with hysteresis, joints with friction, pumped
-air and noisy sensors. Training and calibration never import it. Its parameters are drawn from one integer
-seed and stay private.
+Its model is finer than training's: inexact parts, drawn from a seed, chambers with hysteresis, joints with
+friction, pumped air and noisy sensors.
 
 Hysteresis and friction are stop operators: springs, each in series with a slider. A stop follows the
 displacement x elastically until its force reaches its limit, then slides:
@@ -56,13 +55,7 @@ class StopOperators:
     """Rate-independent hysteresis: m stop operators in parallel on each of n displacements."""
 
     def __init__(self, stiffness: np.ndarray, limit: np.ndarray, x: np.ndarray):
-        """Start without force, at displacements x (n,).
-
-        Args:
-            stiffness (n, m): stiffness of each spring, force per displacement.
-            limit (n, m): largest force of each slider.
-            x (n,): displacements.
-        """
+        """Start without force at displacements x (n,), with springs (n, m) and limits of sliders (n, m)."""
         self._stiffness, self._low, self._high = stiffness, -limit, limit
         self._x = np.array(x, float)
         self._force = np.zeros(np.shape(limit))
@@ -104,7 +97,7 @@ class Twin(InstrumentedArm):
         spec = spec or ArmSpec.default()
         self._parts = draw_parts(seed, spec, build)
         self._build = build
-        super().__init__(self._parts.sensor, seed, session, build)
+        super().__init__(self._parts.spec, self._parts.sensor, seed, session, build)
         self._pipe = pipe
         self._model = build_twin(self._parts, pipe)
         self._data = mujoco.MjData(self._model)
@@ -117,7 +110,7 @@ class Twin(InstrumentedArm):
         mujoco.mj_step1(self._model, self._data)
         self._start_losses(spec)
         now_m = chamber_lengths(self._data, spec.n_chambers)
-        self._air = self._parts.spec.pneumatics(now_m, self._model.opt.timestep)
+        self._air = self._spec.pneumatics(now_m, self._model.opt.timestep)
         # Let the arm come to rest.
         self.attach(payload_kg)
         for _ in range(round(REST_S * spec.control.rate_hz)):
@@ -138,7 +131,7 @@ class Twin(InstrumentedArm):
         torque = bending / np.mean(paper.backbone.bending_stiffness_nm_per_rad)
 
         # Joints (nq, 1), link by link
-        links = self._parts.spec.structure.links_per_section
+        links = self._spec.structure.links_per_section
         ones = np.ones(n_sections)
         limit = FRICTION_LIMIT * np.stack([force, torque, torque], axis=-1)
         stroke = FRICTION_STROKE * np.stack([length, ones, ones], axis=-1)
@@ -156,7 +149,7 @@ class Twin(InstrumentedArm):
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        self._air.command(self._commands(pressure_kpa, self._parts.spec))
+        self._air.command(self._commands(pressure_kpa))
         self._wall_force_n = 0.0
         for _ in range(self._steps):
             self._step()
@@ -166,10 +159,7 @@ class Twin(InstrumentedArm):
         self.time_s += self._steps * self._model.opt.timestep
 
     def _lengths_m(self) -> np.ndarray:
-        return spring_lengths(self._data, self._parts.spec.n_chambers, self._parts.spec.n_springs)
-
-    def _true_kpa(self) -> np.ndarray:
-        return self._air.pressure_kpa
+        return spring_lengths(self._data, self._spec.n_chambers, self._spec.n_springs)
 
     def tip(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the true place (3,) [m] and rotation (3, 3) of the tip, in motion capture's frame."""
@@ -181,7 +171,7 @@ class Twin(InstrumentedArm):
 
     def motion_capture(self) -> Capture:
         """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
-        spec, data = self._parts.spec, self._data
+        spec, data = self._spec, self._data
         n_markers = MARKERS_PER_SECTION * spec.structure.n_sections
         thirds = np.arange(1, n_markers + 1) * spec.structure.links_per_section / MARKERS_PER_SECTION
         bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
@@ -193,7 +183,7 @@ class Twin(InstrumentedArm):
     def _hang(self, payload_kg: float) -> None:
         body = self._model.body("payload").id
         self._model.body_mass[body] = payload_kg
-        self._model.body_inertia[body] = payload_kg * self._parts.spec.mass.gripper_length_m**2 / 12
+        self._model.body_inertia[body] = payload_kg * self._spec.mass.gripper_length_m**2 / 12
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
         mujoco.mj_step1(self._model, self._data)
 
@@ -227,8 +217,7 @@ class Twin(InstrumentedArm):
 
     def _step(self) -> None:
         """Take one time step; afterwards the data hold the lengths and positions at its end."""
-        data = self._data
-        n = len(self._parts.hysteresis)
+        data, n = self._data, self._spec.n_chambers
         length_m = chamber_lengths(data, n)
         data.ctrl[:n] = self._air.step(length_m)
         data.ctrl[n:] = -self._hysteresis.move(length_m)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.pneumatics import Pneumatics
 from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
@@ -67,16 +68,15 @@ def scaled_tolerances(tolerances: Any, gap: float, spec: ArmSpec, **factors: np.
 class InstrumentedArm(abc.ABC):
     """An arm with noisy sensors and cameras; an `ArmIO` with motion capture.
 
-    Args:
-        sensor: the arm's own sensors.
-        seed: chooses the twin.
-        session: chooses the noise.
-        build: scale of the noise, shift of the springs' zeros, lost chamber.
+    The seed chooses the twin, the session its noise; `sensor` is the arm's own.
     """
 
-    def __init__(self, sensor: Sensor, seed: int, session: int, build: Build):
+    _air: Pneumatics
+
+    def __init__(self, spec: ArmSpec, sensor: Sensor, seed: int, session: int, build: Build):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
         shift_m = build.zero_m * (2 * rng.integers(2, size=np.size(sensor.delta_m)) - 1)
+        self._spec = spec
         self._sensor = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m)
         self._scale = build.noise
         self._lost = build.lost
@@ -86,10 +86,6 @@ class InstrumentedArm(abc.ABC):
     @abc.abstractmethod
     def _lengths_m(self) -> np.ndarray:
         """Return the springs' true lengths (n,)."""
-
-    @abc.abstractmethod
-    def _true_kpa(self) -> np.ndarray:
-        """Return the chambers' true pressures (n,)."""
 
     @abc.abstractmethod
     def _hang(self, payload_kg: float) -> None:
@@ -117,8 +113,7 @@ class InstrumentedArm(abc.ABC):
 
     def pressures(self) -> np.ndarray:
         """Return pressures (n,) [kPa] in the chambers, as the regulators' sensors measure them."""
-        kpa = self._true_kpa()
-        return kpa + self._draw(PRESSURE_NOISE_KPA, len(kpa))
+        return self._air.pressure_kpa + self._draw(PRESSURE_NOISE_KPA, self._spec.n_chambers)
 
     def _capture_turn(self) -> np.ndarray:
         """Draw the turn (3, 3) by which motion capture sees the tip's rotation off."""
@@ -132,22 +127,23 @@ class InstrumentedArm(abc.ABC):
         quaternion = quaternion_from_rotation(rotation)
         return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
 
-    def _commands(self, pressure_kpa: np.ndarray, spec: ArmSpec) -> np.ndarray:
+    def _commands(self, pressure_kpa: np.ndarray) -> np.ndarray:
         """Return the commands (n,) [kPa] that the regulators take: clipped, and none for a lost chamber.
 
         Raises:
             ValueError: the shape is wrong, or a pressure is beyond the arm's limits.
         """
-        low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+        n, chambers = self._spec.n_chambers, self._spec.chambers
+        low, high = chambers.pressure_min_kpa, chambers.pressure_max_kpa
         command = np.asarray(pressure_kpa, float)
-        if command.shape != (spec.n_chambers,):
-            raise ValueError(f"pressure_kpa: got shape {command.shape}, expected ({spec.n_chambers},)")
+        if command.shape != (n,):
+            raise ValueError(f"pressure_kpa: got shape {command.shape}, expected ({n},)")
         within = (command >= low - PRESSURE_TOLERANCE_KPA) & (command <= high + PRESSURE_TOLERANCE_KPA)
         if not within.all():
             chamber = int(np.argmin(within))
             text = f"got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
             raise ValueError(f"pressure_kpa[{chamber}]: {text}")
-        return np.where(np.arange(spec.n_chambers) == self._lost, 0.0, np.clip(command, low, high))
+        return np.where(np.arange(n) == self._lost, 0.0, np.clip(command, low, high))
 
     def _draw(self, deviation: float, *shape: int) -> np.ndarray:
         return self._scale * deviation * self._rng.standard_normal(shape)

@@ -49,13 +49,10 @@ _CONTAINER_COLOURS = {
 def add_pipe(
     mjspec: mujoco.MjSpec, pipe: CrossPipe, spec: ArmSpec, base_m: np.ndarray, base_rotation: np.ndarray
 ) -> None:
-    """Add a pipe to an arm's model and let the arm touch it.
+    """Add a pipe to an arm's model from `build_spec`, and let the arm touch it.
 
-    Args:
-        mjspec: model from `mjx_softarm.mechanics.mjcf.build_spec`, in the frame of the arm's own base.
-        pipe: pipe in the base frame, which is motion capture's frame.
-        spec: the arm.
-        base_m (3,) [m], base_rotation (3, 3): the arm's own base in the base frame.
+    The model is in the frame of the arm's own base, at `base_m` (3,) with `base_rotation` (3, 3) in the
+    base frame, which is motion capture's and the pipe's.
     """
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     mjspec.option.disableflags &= ~int(off)

@@ -91,42 +91,43 @@ class RodTwin(InstrumentedArm):
         build: Build = AS_BUILT,
     ):
         """Hang the arm up, unpressurised and at rest; arguments as for `Twin`."""
-        self._spec = spec or ArmSpec.default()
+        spec = spec or ArmSpec.default()
         self._per_section = build.per_section or ELEMENTS_PER_SECTION
         rng = np.random.default_rng(seed)
-        std = _scaled(build.gap, self._spec)
+        std = _scaled(build.gap, spec)
 
         # Mounting of the base and of the tip, then sensors and the rod; the order belongs to the seed
-        mounting = self._spec.mounting
+        mounting = spec.mounting
         self._base_m = mounting.base_offset_m + drawn(rng, std.base_offset_m, 3)
         tilt = rotation_about(np.radians(drawn(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
         self._base_rotation = rotation_about(np.radians(mounting.base_turn_deg)) @ tilt
         self._tip_m = mounting.tip_offset_m + drawn(rng, std.tip_offset_m, 3)
         tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
         self._tip_turn = rotation_about(np.radians(mounting.tip_turn_deg)) @ tip_turn
-        sensor = self._spec.spring_sensor
-        beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, self._spec.n_springs))
-        delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, self._spec.n_springs)
-        super().__init__(dataclasses.replace(sensor, beta=beta, delta_m=delta_m), seed, session, build)
-        parts = draw_rod(rng, seed, self._spec, std, self._base_rotation[2])
+        sensor = spec.spring_sensor
+        beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, spec.n_springs))
+        delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, spec.n_springs)
+        sensor = dataclasses.replace(sensor, beta=beta, delta_m=delta_m)
+        super().__init__(spec, sensor, seed, session, build)
+        parts = draw_rod(rng, seed, spec, std, self._base_rotation[2])
         parts = parts._replace(stiffness=(1.0 - build.softening) * parts.stiffness)
         self._rod = self.rod_kind(parts, self._per_section)
 
         # Chambers with air and regulators
-        self._period_s = 1.0 / self._spec.control.rate_hz
+        self._period_s = 1.0 / spec.control.rate_hz
         area_m2, slope_m = 1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()
-        rest_m = self._spec.at_chambers(self._spec.geometry.section_length_m)
+        rest_m = spec.at_chambers(spec.geometry.section_length_m)
         now_m = self._rod.chamber_lengths()
-        regulator = draw_regulator(seed, self._spec, build.losses)
+        regulator = draw_regulator(seed, spec, build.losses)
         self._air = Pneumatics(area_m2, slope_m, rest_m, now_m, self._period_s / AIR_STEPS, regulator)
 
         # At rest without pressure
         self.attach(payload_kg)
-        self.settle(np.zeros(self._spec.n_chambers))
+        self.settle(np.zeros(spec.n_chambers))
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        self._air.command(self._commands(pressure_kpa, self._spec))
+        self._air.command(self._commands(pressure_kpa))
         length_m = self._rod.chamber_lengths()
         for _ in range(AIR_STEPS):
             self._air.step(length_m)
@@ -135,15 +136,12 @@ class RodTwin(InstrumentedArm):
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
         """Move to rest at pressures (n,) [kPa] without time passing."""
-        pressure_kpa = self._commands(pressure_kpa, self._spec)
+        pressure_kpa = self._commands(pressure_kpa)
         self._rod.settle(pressure_kpa)
         self._air.hold(pressure_kpa, self._rod.chamber_lengths())
 
     def _lengths_m(self) -> np.ndarray:
         return self._rod.spring_lengths()
-
-    def _true_kpa(self) -> np.ndarray:
-        return self._air.pressure_kpa
 
     def motion_capture(self) -> Capture:
         """Return the tip, and markers in the rod at each third of a section, from the base to the tip."""
@@ -164,14 +162,9 @@ class RodTwin(InstrumentedArm):
 def draw_rod(
     rng: np.random.Generator, seed: int, spec: ArmSpec, std: RodTolerances, up: np.ndarray
 ) -> RodParts:
-    """Draw the numbers of a rod.
+    """Draw the numbers of a rod; `up` (3,) points against gravity, in the axes of its base.
 
-    Args:
-        rng: random numbers, in the middle of the rod's draws.
-        seed: seed of the rod, for the random numbers of the chambers' laws.
-        spec: arm.
-        std: deviations.
-        up (3,): direction against gravity, in the axes of the rod's base.
+    `rng` is in the middle of the rod's draws; the chambers' laws have random numbers of the seed.
     """
     # Numbers of sections (s,), and of chambers (s, c)
     geometry, chambers, backbone = spec.geometry, spec.chambers, spec.backbone
@@ -243,13 +236,7 @@ def _holes(
 
 
 def draw_regulator(seed: int, spec: ArmSpec, deadband: float = 1.0) -> Regulator:
-    """Draw the regulators of a rod, with random numbers of their mean.
-
-    Args:
-        seed: seed of the rod.
-        spec: arm, for its chambers and its range of pressures.
-        deadband: factor of the deadband.
-    """
+    """Draw the regulators of a rod from its seed; `deadband` is a factor of their deadband."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
     range_kpa = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
 

@@ -25,7 +25,7 @@ from mjx_softarm.logs.files import check_file
 from mjx_softarm.policy.file import SHIPPED, SHIPPED_TWIN, load_policy
 from mjx_softarm.spec import ArmSpec
 
-PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
+PROGRAM = "python -m mjx_softarm.view"
 HINT = "try next: hang 500 g with the payload slider; the loop estimates it and corrects the circle"
 
 
@@ -61,7 +61,7 @@ def _view(
     demos: cli.MaybePath = None,
     spec: cli.SpecFile = None,
     html: cli.MaybePath = None,
-    host: str = HERE,
+    host: str = "127.0.0.1",
     port: int = 8080,
 ) -> int:
     """Show an arm in the browser and steer it there, or replay logs.
@@ -94,7 +94,7 @@ def _view(
     hint = HINT if on.file == SHIPPED_TWIN else ""
     setup = Setup(read, on.arm, host, port, hasattr(io, "attach"), demos is not None, hint)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
-    status = live(setup, io, tell, partial(_welcome, host), *saves).status
+    status = live(setup, io, tell, *saves).status
     finish(io, tell)
     return status
 
@@ -111,12 +111,6 @@ def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str,
     server = open_server(host, port, ", ".join(timeline.name for timeline in timelines))
     tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
     return replay(server, spec, timelines)
-
-
-def _welcome(host: str, url: str) -> None:
-    tell(f"open {url}; Ctrl-C vents the arm and ends")
-    if host not in (HERE, "localhost"):
-        tell(f"--host {host}: everybody who reaches this address can move the arm; there is no password")
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ from mjx_softarm.view.look import look_at
 if TYPE_CHECKING:
     from mjx_softarm.view.page import Setup
 
+LOCAL = ("127.0.0.1", "localhost")  # hosts that other machines do not reach
 READY_S = 60.0  # for the server to start
 N_LINES = 4  # number of the loop's last messages on the page
 APART = np.repeat([1.0, 1.0], 3)  # [mm, deg] smallest difference from the last taken pose, in one number
@@ -58,9 +59,7 @@ class TakenPoses:
     def take(self, state: LoopState, row: Mapping[str, Any]) -> str:
         """Keep the pose of a tick if training can use it; return a message.
 
-        Args:
-            state: state of the loop after the tick.
-            row: log row of the tick. Without motion capture its estimate is the pose.
+        Without motion capture, the estimate of the tick's row is the pose.
         """
         seen = np.isfinite(row.get("tip_quaternion", np.nan)).all()
         pose = pose_from_quaternion(row["tip_m"], row["tip_quaternion"]) if seen else row["estimate"]
@@ -206,19 +205,12 @@ def live(
     setup: Setup,
     arm: Any,
     tell: Callable[[str], None],
-    ready: Callable[[str], None],
     save: Callable[[Log], None] | None,
     save_demonstrations: Callable[[Log], None] | None,
 ) -> LoopRun:
     """Steer an arm from a page until something ends it; after a fault the page stays until Ctrl-C.
 
-    Args:
-        setup: settings of the page.
-        arm: an `ArmIO`.
-        tell: takes a line for each arrival and each fault.
-        ready: takes the page's address.
-        save: writes the run's log.
-        save_demonstrations: writes the taken poses, if there are any.
+    `tell` takes a line for the page's address, each arrival and each fault.
 
     Raises:
         InputError: the page cannot be served.
@@ -235,7 +227,10 @@ def live(
     end, controller = ChannelEnd(ours), Controller.of(setup.policy)
     try:
         # Steer the arm, then save its poses and tell the end.
-        ready(_address(end))
+        tell(f"open {_address(end)}; Ctrl-C vents the arm and ends")
+        if setup.host not in LOCAL:
+            warning = "everybody who reaches this address can move the arm; there is no password"
+            tell(f"--host {setup.host}: {warning}")
         pilot = PagePilot(end, arm, controller, tell)
         arm = Paced(arm) if hasattr(arm, "time_s") else arm
         run = steer(arm, controller, pilot.orders, pilot.look, pilot.tell, save)

@@ -37,14 +37,7 @@ _RING_M, _WIRE_M, _MOUNT_M = 0.005, 7e-4, (0.095, 0.04)  # height; radius; radiu
 
 
 class Stage:
-    """One arm in the scene; several arms can stand side by side.
-
-    Args:
-        scene: scene of the server.
-        spec: the arm.
-        name: name of the arm's node.
-        place_m: (3,) place of the arm's base.
-    """
+    """One arm in the scene, with its base at `place_m`; several arms can stand side by side."""
 
     def __init__(
         self,

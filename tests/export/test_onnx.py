@@ -92,23 +92,20 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     agreeing_graph(draw_wire_policy(), tmp_path / "wires.npz")
 
 
-def test_an_arm_of_six_chambers_and_three_springs_a_section(tmp_path):
-    """References and lengths are per spring, pressures and the law's integral per chamber."""
-    _, whole = agreeing_graph(moving_policy(SIX_CHAMBERS), tmp_path / "other.npz")
-    golden = read_golden(tmp_path / "other_golden.csv")
-    assert check(golden, tmp_path / "other_check.onnx").error == 0.0
-    assert check(golden, tmp_path / "other.npz").holds
-    session = ort.InferenceSession(whole)
+def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
+    """Without what it saw before, it answers as at its first action; with it, as the loop at its second.
+
+    Of its arm, references and lengths are per spring, pressures and the law's integral per chamber.
+    """
+    controller, whole = agreeing_graph(moving_policy(SIX_CHAMBERS), tmp_path / "moving.npz")
+    golden, session = read_golden(tmp_path / "moving_golden.csv"), ort.InferenceSession(whole)
+    assert check(golden, tmp_path / "moving_check.onnx").error == 0.0
+    assert check(golden, tmp_path / "moving.npz").holds
     items = *session.get_inputs(), *session.get_overridable_initializers(), *session.get_outputs()
     size = {item.name: item.shape for item in items}
     assert size["readings"] == size["before_m"] == size["reference_m"] == [SIX_CHAMBERS.n_springs]
     assert size["pressure_kpa"] == size["integral_kpa"] == [SIX_CHAMBERS.n_chambers]
-
-
-def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
-    """Without what it saw before, it answers as at its first action; with it, as the loop at its second."""
-    controller, whole = agreeing_graph(moving_policy(), tmp_path / "moving.npz")
-
+    # The first two actions of the loop, while the springs swing
     goal = controller.policy.workspace[0].astype(float)
     state, _ = with_goal(controller, start(controller), goal)
     swing_m = 0.18 + 0.01 * np.sin(0.3 * np.arange(20))[:, None] * np.linspace(0.5, 1.0, N)
@@ -123,10 +120,10 @@ def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
     motion = {"before_m": seen_m[at - 5], "last_reference_m": before.command.reference_m}
     feed = {"readings": readings, "goal": goal, "integral_kpa": before.command.law.integral_kpa} | motion
     feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
-    [reference_m] = ort.InferenceSession(whole).run(["reference_m"], feed)
+    [reference_m] = session.run(["reference_m"], feed)
     np.testing.assert_allclose(reference_m, state.command.reference_m, atol=2e-6)
     seen_alone = {name: feed[name] for name in ("readings", "goal")}
-    [blind_m] = ort.InferenceSession(whole).run(["reference_m"], seen_alone)
+    [blind_m] = session.run(["reference_m"], seen_alone)
     assert np.abs(blind_m - state.command.reference_m).max() > 1e-4
 
 

@@ -1,8 +1,5 @@
 """The rod twin behind `ArmIO`."""
 
-import ast
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,9 +7,8 @@ from scipy.spatial.transform import Rotation
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.twin import rod, rod_twin
 from mjx_softarm.twin.instruments import Build
-from mjx_softarm.twin.rod_twin import RodTwin
+from mjx_softarm.twin.rod_twin import RodTwin, draw_regulator
 from tests.twin.conftest import KPA, hold
 
 EXACT = Build(losses=0.0, noise=0.0, per_section=3)  # without deadband and noise
@@ -39,7 +35,7 @@ def test_mount_and_tilt_show_with_the_arm_hanging():
 
 
 def test_pressures_and_tip_follow_with_a_lag():
-    arm, regulator = RodTwin(101, build=EXACT), rod_twin.draw_regulator(101, ArmSpec.default(), 0.0)
+    arm, regulator = RodTwin(101, build=EXACT), draw_regulator(101, ArmSpec.default(), 0.0)
     arm.write_pressures(KPA)
     np.testing.assert_array_equal(arm.pressures(), 0.0)  # dead times are longer than a control period
     hold(arm, KPA, 0.98)
@@ -58,10 +54,3 @@ def test_it_has_a_name():
     assert isinstance(open_arm("twin:rod:3"), RodTwin)
     with pytest.raises(InputError, match="twin:rod:SEED: got '.*', expected an integer >= 0"):
         open_arm("twin:rod:3:pipe300")
-
-
-@pytest.mark.parametrize("module", [rod, rod_twin])
-def test_it_is_written_without_the_training_model(module):
-    tree = ast.parse(Path(module.__file__).read_text("utf-8"))
-    imported = " ".join(ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom))
-    assert imported and "mechanics" not in imported and "mujoco" not in imported

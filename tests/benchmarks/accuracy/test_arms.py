@@ -31,7 +31,7 @@ def test_the_picture_has_a_line_for_each_stand_in_over_its_minutes():
 @pytest.mark.slow
 def test_smoke_and_what_was_made_is_not_made_again(tmp_path, monkeypatch):
     monkeypatch.setattr(common, "RESULTS", tmp_path / "results")
-    options = ["--poses", "80", "--preset", "quick", "--steps", "4096", "--points", "2"]
+    options = ["--poses", "80", "--steps", "4096", "--points", "2"]
     words = ["arms", "--arms", "stiff-flop", *options, "--keep", str(tmp_path / "arms")]
     assert main(words) in (0, 1)  # a target may be missed after so little
     figures = json.loads((tmp_path / "results/arms.json").read_text("utf-8"))["figures"]["arms"]

@@ -1,8 +1,5 @@
 """Stages run once, in their order, elsewhere; commands that fail are named; trainings resume."""
 
-import subprocess
-import sys
-
 import pytest
 
 from benchmarks.harness import stages
@@ -24,17 +21,17 @@ def fail(folder, settings):
 
 def test_stages_run_elsewhere_group_by_group_and_only_where_a_result_is_missing(tmp_path):
     groups = [
-        [WorkStage("first", ("a",), leave, ("a",))],
-        [WorkStage("second", ("b", "c"), leave, ("b", "c"))],
+        [WorkStage(("a",), leave, ("a",))],
+        [WorkStage(("b", "c"), leave, ("b", "c"))],
     ]
     run_stages(tmp_path, None, groups)
     (tmp_path / "c").unlink()  # one of two results
     run_stages(tmp_path, None, groups)
     assert (tmp_path / "calls.txt").read_text().splitlines() == ["a", "b c", "b c"]
-    with pytest.raises(InputError, match="bad: ValueError: not today"):
-        run_stages(tmp_path, None, [[WorkStage("bad", ("d",), fail)]])
-    with pytest.raises(InputError, match="empty: InputError: got no e in .*, expected its results"):
-        run_stages(tmp_path, None, [[WorkStage("empty", ("e",), leave, ("f",))]])
+    with pytest.raises(InputError, match="d: ValueError: not today"):
+        run_stages(tmp_path, None, [[WorkStage(("d",), fail)]])
+    with pytest.raises(InputError, match="e: InputError: got no e in .*, expected its results"):
+        run_stages(tmp_path, None, [[WorkStage(("e",), leave, ("f",))]])
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path):
@@ -44,27 +41,25 @@ def test_a_folder_of_other_settings_is_refused(tmp_path):
         claim(tmp_path, {"n_points": 40, "names": ("a",)})
 
 
-@pytest.mark.parametrize(("status", "writes"), [(0, True), (1, True), (1, False), (-9, True)])
-def test_a_command_with_results_goes_on_and_another_is_named(tmp_path, monkeypatch, status, writes):
+PROGRAM = """
+import pathlib, sys
+print("its last words")
+pathlib.Path(sys.argv[1]).touch()
+sys.exit(int(sys.argv[2]))
+"""
+
+
+def test_a_command_with_results_goes_on_and_another_is_named(tmp_path, monkeypatch):
     """Status 1 says that a bound is missed, or that Python ended with a traceback."""
+    (tmp_path / "measuring.py").write_text(PROGRAM)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     log, made = tmp_path / "calib.log", tmp_path / "report.json"
-
-    def run(words, stdout, **_):
-        assert words == [sys.executable, "-m", "calib", "run", "3"]
-        stdout.write("its last words")
-        if writes:
-            made.touch()
-        return subprocess.CompletedProcess([], status)
-
-    monkeypatch.setattr(stages.subprocess, "run", run)
-    if status in (0, 1) and writes:
-        command(log, "calib", "run", 3, makes=made)
-    else:
-        message = (
-            rf"(?s)python -m calib run 3: got exit status {status}, expected .*ends with\nits last words"
-        )
+    for status in (0, 1):
+        command(log, "measuring", made, status, makes=made)
+    for status, makes in ((1, tmp_path / "absent"), (3, made)):
+        message = rf"(?s)python -m measuring .* {status}: got exit status {status}, .*\nits last words"
         with pytest.raises(InputError, match=message):
-            command(log, "calib", "run", 3, makes=made)
+            command(log, "measuring", made, status, makes=makes)
 
 
 def test_a_training_resumes_and_without_a_checkpoint_or_a_config_starts_anew(tmp_path, monkeypatch):

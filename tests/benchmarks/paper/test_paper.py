@@ -8,14 +8,11 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.paper import experiments, pictures, report
 from benchmarks.paper.trials import Settings, Trial, run_path, trials
-from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import save_policy
-from tests.benchmarks.paper.made_up import make_policy
+from tests.benchmarks.paper.made_up import SPEC, N, make_policy
 
-SPEC = ArmSpec.default()
-N = SPEC.n_chambers
 TINY = Settings(twins=(0, 1), seeds=(0,), n_points=3, loads_g=(500, 1000), beside=("payload",))
 
 

@@ -1,13 +1,12 @@
 """The sim-to-real fit on a planted arm and on the logs of a real trunk."""
 
-import functools
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from benchmarks.accuracy.calibration import trunk_errors
+from benchmarks.accuracy.calibration import TRUNK_LOG, read_trunk, trunk_errors
 from calib.fit.blocks import held_out_blocks
 from calib.fit.pose_errors import pose_errors
 from calib.fit.s2r import OF_ROWS, NetworkConfig, fit_network, fit_printed, fit_s2r, moved, simulate_poses
@@ -166,11 +165,13 @@ def test_a_constant_input_and_a_constant_output_do_no_harm():
 
 @needs_data
 def test_real_trunk_beats_the_cubic_polynomial():
-    errors = trunk_errors(DATA, "1", functools.partial(held_out_blocks, seed=1))
+    log = read_trunk(DATA / TRUNK_LOG.format(1))
+    errors = trunk_errors([log], held_out_blocks(len(log.fresh), seed=1))
     assert errors["network"] <= 7.5 < errors["cubic"] < errors["linear"]
 
 
 @needs_data
 def test_real_trunk_does_not_blow_up_outside_of_its_training_rows():
-    errors = trunk_errors(DATA, "11", lambda n: np.arange(n) >= 0.8 * n)
+    log = read_trunk(DATA / TRUNK_LOG.format(11))
+    errors = trunk_errors([log], np.arange(len(log.fresh)) >= 0.8 * len(log.fresh))
     assert errors["network"] < errors["linear"] < 100.0 < errors["cubic"]
