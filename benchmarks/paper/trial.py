@@ -85,7 +85,7 @@ class Gripper:
             if np.linalg.norm(finger_m - self._goals_m[k]) <= PLACE_M:
                 self._lying[container], self.success[k] = (finger_m, self._held_kg), True
             self._held_kg, self._hung_kg = None, 0.0
-            self._arm.release()
+            self._arm.attach(0.0)
 
     def _finger_m(self) -> np.ndarray:
         """Return the true place of the finger tips (3,) [m]."""
@@ -109,12 +109,11 @@ def operate(
     # Watch the twin's contact forces and its gripper.
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces_n: list[float] = []
-    force = getattr(twin, "wall_force_n", lambda: 0.0)  # a rod touches nothing
     gripper = Gripper(twin, names, finger_tips(*frame_from_pose(goals), gripper_m), trial.objects, gripper_m)
 
     def note() -> None:
         """Note the wall's force of a control period, and let a floor carry what is held."""
-        forces_n.append(force())
+        forces_n.append(getattr(twin, "wall_force_n", 0.0))  # a rod touches nothing
         gripper.hang()
 
     watch(twin, note)

@@ -46,13 +46,15 @@ class Contestant(NamedTuple):
 class HeldOut:
     """Evaluation at held-out goals as in `train.runs.evaluate`, for policies of any library."""
 
-    def __init__(self, env: Any, n_goals: int):
+    def __init__(self, n_goals: int):
         import jax
 
         from mjx_softarm._support import xla
+        from mjx_softarm.env import ReachEnv
         from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
         from train.runs.evaluate import N_ACTIONS, paths_of, start_keys, towards
 
+        env = ReachEnv()
         self.n_goals, self.n_actions = n_goals, N_ACTIONS
         self._paths = paths_of(env.sample_pool(n_goals, HELD_OUT_SEED).pose)  # (n_arms, k, 6)
         self._start = xla.jit(jax.vmap(env.reset))(start_keys(len(self._paths)))
@@ -199,13 +201,11 @@ def library_of(name: str) -> str:
     return name.removesuffix("-hindsight")
 
 
-def prepare(
-    contestant: Contestant, start_up_s: float, stretch_s: float, n_goals: int
-) -> tuple[Facts, Callable[[], Facts]]:
-    """Return the facts and the rounds of a worker: each round is a stretch of training and an evaluation."""
-    from mjx_softarm.env import ReachEnv
-
-    held_out = HeldOut(ReachEnv(), n_goals)
+def prepare(name: str, seed: str, stretch_s: str, n_goals: str) -> tuple[Facts, Callable[[], Facts]]:
+    """Prepare a contestant; each round is a stretch of training and an evaluation."""
+    contestant = (ours if name.startswith("ours") else peer)(name, int(seed))
+    start_up_s = time.perf_counter() - START - contestant.uncounted_s
+    held_out = HeldOut(int(n_goals))
     held_out.tip_error_mm(contestant.policy)  # compiles
     trained_s = 0.0
 
@@ -216,7 +216,7 @@ def prepare(
             contestant.train()
             n_env_steps, n_updates = contestant.done()
             ended, passed_s = n_env_steps >= contestant.limit, time.perf_counter() - start
-            if ended or passed_s >= stretch_s:
+            if ended or passed_s >= float(stretch_s):
                 break
         trained_s += passed_s
         median_mm = float(np.median(held_out.tip_error_mm(contestant.policy)))
@@ -232,11 +232,5 @@ def prepare(
     return {"start_up_s": start_up_s}, work
 
 
-def _prepare(name: str, seed: str, stretch_s: str, n_goals: str) -> tuple[Facts, Callable[[], Facts]]:
-    contestant = (ours if name.startswith("ours") else peer)(name, int(seed))
-    start_up_s = time.perf_counter() - START - contestant.uncounted_s
-    return prepare(contestant, start_up_s, float(stretch_s), int(n_goals))
-
-
 if __name__ == "__main__":
-    serve(lambda: _prepare(*sys.argv[1:]))
+    serve(lambda: prepare(*sys.argv[1:]))

@@ -102,7 +102,7 @@ class Twin(InstrumentedArm):
         self._model = build_twin(self._parts, pipe)
         self._data = mujoco.MjData(self._model)
         self._wall = is_wall(self._model)
-        self._wall_force_n = 0.0
+        self.wall_force_n = 0.0  # largest contact force of the walls in the last control period
         self._base_m = self._parts.base_position_m
         self._base_rotation = self._parts.base_rotation
         # Start clock, losses and air.
@@ -150,7 +150,7 @@ class Twin(InstrumentedArm):
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
         self._air.command(self._commands(pressure_kpa))
-        self._wall_force_n = 0.0
+        self.wall_force_n = 0.0
         for _ in range(self._steps):
             self._step()
         if self._data.warning.number.any():  # MuJoCo would reset the state by itself
@@ -187,10 +187,6 @@ class Twin(InstrumentedArm):
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
         mujoco.mj_step1(self._model, self._data)
 
-    def wall_force_n(self) -> float:
-        """Return the walls' largest contact force [N] in the last control period; 0 without a pipe."""
-        return self._wall_force_n
-
     def renderer(self, width: int, height: int) -> Any:
         """Return a `mjx_softarm.mechanics.drawing.render.Renderer` of this twin, for `draw`.
 
@@ -224,5 +220,5 @@ class Twin(InstrumentedArm):
         data.qfrc_applied[:] = -self._friction.move(data.qpos)
         mujoco.mj_step2(self._model, data)
         if self._pipe is not None:
-            self._wall_force_n = max(self._wall_force_n, contact_force_n(data, self._wall))
+            self.wall_force_n = max(self.wall_force_n, contact_force_n(data, self._wall))
         mujoco.mj_step1(self._model, data)

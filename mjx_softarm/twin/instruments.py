@@ -71,7 +71,7 @@ class InstrumentedArm(abc.ABC):
     The seed chooses the twin, the session its noise; `sensor` is the arm's own.
     """
 
-    _air: Pneumatics
+    _air: Pneumatics  # a kind of twin makes it
 
     def __init__(self, spec: ArmSpec, sensor: Sensor, seed: int, session: int, build: Build):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
@@ -92,7 +92,7 @@ class InstrumentedArm(abc.ABC):
         """Replace the payload at the finger tips."""
 
     def attach(self, payload_kg: float) -> None:
-        """Hang a payload to the finger tips, in place of an earlier payload.
+        """Hang a payload to the finger tips, in place of an earlier payload; 0 is none.
 
         Raises:
             ValueError: the mass is negative or not finite.
@@ -100,10 +100,6 @@ class InstrumentedArm(abc.ABC):
         if not (np.isfinite(payload_kg) and payload_kg >= 0.0):
             raise ValueError(f"payload_kg: got {payload_kg!r}, expected a number >= 0")
         self._hang(payload_kg)
-
-    def release(self) -> None:
-        """Remove the payload."""
-        self.attach(0.0)
 
     def read_sensors(self) -> np.ndarray:
         """Return readings (n,) of the springs' sensors: noisy, in steps of the converter; see `ArmIO`."""

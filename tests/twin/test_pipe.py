@@ -129,18 +129,18 @@ def test_gripper_pressed_against_the_wall(direction):
         hold(arm, 0.0, 0.02)
         deepest_m.append(-arm._data.contact.dist.min() if arm._data.ncon else 0.0)
     assert max(deepest_m) < 5e-3 and deepest_m[-1] < 1e-3
-    assert 10.0 < arm.wall_force_n() < 25.0
+    assert 10.0 < arm.wall_force_n < 25.0
 
 
 def test_force_is_that_of_the_last_period():
     arm = Twin(3, build=QUIET, pipe=PIPE)
-    assert arm.wall_force_n() == 0.0
+    assert arm.wall_force_n == 0.0
     push(arm, "link14", [0.0, 30.0, 0.0])
     hold(arm, 0.0, 0.8)
-    assert arm.wall_force_n() > 1.0
+    assert arm.wall_force_n > 1.0
     push(arm, "link14", 0.0)
     hold(arm, 0.0, 4.0)
-    assert arm.wall_force_n() == 0.0
+    assert arm.wall_force_n == 0.0
 
 
 def test_arm_that_touches_nothing_moves_as_without_a_pipe():
@@ -148,7 +148,7 @@ def test_arm_that_touches_nothing_moves_as_without_a_pipe():
     for pipe in (None, PIPE):
         arm = Twin(7, build=Build(noise=0.0), pipe=pipe)
         hold(arm, KPA, 3.0)
-        assert arm.wall_force_n() == 0.0
+        assert arm.wall_force_n == 0.0
         tips_m.append(arm.motion_capture().tip_m)
     np.testing.assert_allclose(*tips_m, atol=1e-9)
 
@@ -167,7 +167,7 @@ def test_survives_random_extremes_in_the_pipe():
             assert ((bodies == 0).sum(axis=1) == 1).all()
             assert arm._data.ncon == 0 or contact.dist.min() > -0.02
             assert (clearance(pipe, arm.motion_capture().marker_m) > 0.04).all()
-            assert np.isfinite(arm.wall_force_n()).all()
+            assert np.isfinite(arm.wall_force_n).all()
     assert touched > 100
 
 
@@ -175,10 +175,10 @@ def test_arms_in_pipes_by_name():
     arm = open_arm("twin:7:pipe250")
     assert arm._pipe == CrossPipe.of_mm(250.0) and open_arm("twin:7")._pipe is None
     in_pipe, loaded = open_arm("twin:7:pipe300"), open_arm("twin:7:pipe300:220g")
-    assert in_pipe.wall_force_n() == 0.0
+    assert in_pipe.wall_force_n == 0.0
     assert loaded.motion_capture().tip_m[2] < in_pipe.motion_capture().tip_m[2] - 1e-3
     # Floors of 200 mm would have no width, and MuJoCo compiles none on some twins
-    assert all(open_arm(f"twin:{seed}:pipe200").wall_force_n() == 0.0 for seed in (1, 4))
+    assert all(open_arm(f"twin:{seed}:pipe200").wall_force_n == 0.0 for seed in (1, 4))
 
 
 def test_picture_shows_what_the_arm_holds_in_the_pipe():
