@@ -85,9 +85,9 @@ def springs(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepRe
     """Fit beta and delta of the springs' sensors."""
     spec = arm.spec
     pairs = [
-        (readings, log.spring_m)
+        (log.readings, log.spring_m)
         for log in measurements.logs
-        if (readings := log.readings_of(spec.sensor)) is not None and log.spring_m is not None
+        if log.readings is not None and log.spring_m is not None
     ]
     if not pairs:
         needed = "No log has both readings and measured spring lengths."
@@ -166,7 +166,7 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     spec, poses, n_unsettled = arm.spec, _unloaded(measurements, arm.spec), 0
     settled = simulate_poses(spec, poses.spring_m) if poses.n else None
     if settled is not None:
-        n_unsettled = np.count_nonzero(~settled.valid)
+        n_unsettled = int(np.count_nonzero(~settled.valid))
         poses, settled = poses.take(settled.valid), settled.take(settled.valid)
     if settled is None or poses.n < MIN_S2R_POSES:
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"

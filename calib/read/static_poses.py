@@ -66,9 +66,6 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
 
     Returns:
         The poses, and the number of rows by use. A log with readings gives no spring lengths, but readings.
-
-    Raises:
-        LogError: a log has readings of another kind of sensor.
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     row_uses = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
@@ -102,9 +99,8 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
     assert log.pressure_kpa is not None
     # Fill what the log does not have.
     unknown = np.full((len(log), spec.n_springs), np.nan)
-    readings = log.readings_of(spec.sensor)
-    springs = unknown if readings is not None or log.spring_m is None else log.spring_m
-    readings = unknown if readings is None else readings
+    springs = unknown if log.readings is not None or log.spring_m is None else log.spring_m
+    readings = unknown if log.readings is None else log.readings
     markers = np.full((len(log), n_markers, 3), np.nan)
     if log.marker_m is not None and log.marker_m.shape[1] == n_markers:
         markers = log.marker_m
@@ -143,8 +139,7 @@ def _rests_of_loop(
     """Find the rows of each rest in a log of the control loop: the last window of each goal that stood."""
     assert log.goal is not None
     n, still_m, _ = rest_rule(spec, _lag_s(spec))
-    readings = log.readings_of(spec.sensor)
-    watched_m = log.spring_m if readings is None else spec.spring_sensor.lengths(readings, np.nan).length_m
+    watched_m = log.lengths_m(spec.spring_sensor)
     # A goal that stands for a window, and no longer than the payload; a moving goal has no such rows
     asked = np.column_stack([log.goal, payload_kg])
     cuts = np.flatnonzero((asked[1:] != asked[:-1]).any(axis=1)) + 1

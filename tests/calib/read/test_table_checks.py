@@ -103,7 +103,7 @@ def test_gaps_and_constant_columns_are_reported_alone(file):
     found = [(f.column, f.rows, f.n_dropped) for f in findings]
     assert found == [("time", (102, 102), 0), ("pressure5", (2, N + 1), 0), ("tip_x..z", (2, N + 1), 0)]
     assert "longest 3.02 s, expected steps near 0.02 s" in findings[0].problem
-    assert "got always 7.5 kPa" in findings[1].problem
+    assert "the same value, 7.5 kPa," in findings[1].problem
     assert len(log) == N
 
 
