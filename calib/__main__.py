@@ -155,7 +155,7 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
         raise InputError("LOG: got nothing, expected one log or more")
     logs, findings = [], []
     for path in paths:
-        log, of_log = read_log(path, spec, strict)
+        log, of_log = read_log(path, spec)
         of_log = [*of_log, *(Finding(str(path), None, WIRING, fault) for fault in wiring_faults(log, spec))]
         if strict and of_log:
             raise LogError(of_log)

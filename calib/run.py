@@ -114,13 +114,7 @@ def refuse_existing(folder: Path) -> None:
 def write_calibration(
     folder: Path, calibration: Calibration, findings: Sequence[str], provenance: dict[str, Any]
 ) -> None:
-    """Write the folder, whole or not at all.
-
-    Args:
-        folder: folder to write.
-        calibration: what to write.
-        findings: faults of the logs, for the report.
-        provenance: versions, machine and commit, for the report.
+    """Write the folder, whole or not at all; the report has the logs' findings and the provenance.
 
     Raises:
         FileExistsError: the folder exists and is not empty.

@@ -39,32 +39,26 @@ One row per pose will do if the rows are more than 3 s apart.
 NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # a log has one of these at least
 
 
-def read_log(
-    path: str | Path, spec: ArmSpec | None = None, strict: bool = False
-) -> tuple[Log, list[Finding]]:
+def read_log(path: str | Path, spec: ArmSpec | None = None) -> tuple[Log, list[Finding]]:
     """Read a log, keep the rows that can be believed, and report the faults of the others.
 
     Args:
         path: CSV file, or npz file by its suffix.
         spec: the arm, by default the paper's; a log of an arm with another sensor, or other numbers of
             chambers or springs, is refused.
-        strict: refuse a log with any finding.
 
     Returns:
         The log, with finite numbers only, and the findings.
 
     Raises:
-        LogError: the log cannot be used or is refused; the message has a line for each finding.
+        LogError: the log cannot be used; the message has a line for each finding.
     """
     spec = spec or ArmSpec.default()
     matrix, findings = read_matrix(path, spec, one_of=NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
         refuse(implausible(matrix, spec))
         matrix, cleaning = clean(matrix)
-    findings += cleaning
-    if strict:
-        refuse(findings)
-    return matrix.log(), findings
+    return matrix.log(), findings + cleaning
 
 
 def template(path: str | Path) -> str:
@@ -296,8 +290,8 @@ def _renewal(matrix: LogMatrix) -> Iterator[RowFault]:
             always = _shown(matrix.columns[k], matrix.values[0, k])
             problem = f"the same value, {always}, expected a sensor that changes"
             yield RowFault(matrix.columns[k].name, problem, everywhere, drops=False)
-    for name, axes in matrix.bodies():
-        body = matrix.values[:, axes]
+    for axes in np.reshape(matrix.indices("tip_m", "marker_m"), (-1, 3)).astype(int):
+        name, body = matrix.columns[axes[0]].name[:-2], matrix.values[:, axes]
         if np.ptp(body, axis=0).max() > MOVES_M:
             # A quaternion that changes shows that the tip was seen, though its position stays.
             seen = matrix.indices("tip_quaternion") if name == "tip" else []

@@ -36,12 +36,6 @@ class LogMatrix(NamedTuple):
         """Return the indices of the columns of these fields of `Log`."""
         return [k for k, column in enumerate(self.columns) if column.group in groups]
 
-    def bodies(self) -> Iterator[tuple[str, list[int]]]:
-        """Yield the names of tip and markers, each with the indices of its coordinates."""
-        columns = self.indices("tip_m", "marker_m")
-        for start in range(0, len(columns), 3):
-            yield self.columns[columns[start]].name[:-2], columns[start : start + 3]
-
     def log(self) -> Log:
         """Return the columns as a log."""
         groups: dict[str, Any] = {

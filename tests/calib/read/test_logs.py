@@ -16,7 +16,7 @@ from tests.calib.read.arm_logs import N, arm_log, csv, planted
 @pytest.mark.parametrize("seed", range(3))
 def test_clean_log_comes_back_without_findings(file, name, seed):
     changes = {"seed": seed, "sequence": np.repeat(np.arange(8.0), N // 8)}
-    log, findings = read_log(file(name, **changes), strict=True)
+    log, findings = read_log(file(name, **changes))
     assert findings == []
     expected = arm_log(**changes)
     np.testing.assert_array_equal(log.row, expected.row)
@@ -54,7 +54,7 @@ def test_a_row_per_pose_comes_back_without_findings(file, seed):
         "marker_m": None,
         "time_s": 3.0 * np.arange(N),
     }
-    assert read_log(file(**poses), strict=True)[1] == []
+    assert read_log(file(**poses))[1] == []
 
 
 def test_units_and_order_of_the_file_do_not_matter(text):
@@ -73,7 +73,7 @@ def test_units_and_order_of_the_file_do_not_matter(text):
         order = rng.permutation(len(columns))
         headers = [f"{columns[k].name} [{units[k]}]" for k in order]
         content = csv(headers, (inside / factors)[:, order])
-        log, findings = read_log(text(content, f"{trial}.csv"), strict=True)
+        log, findings = read_log(text(content, f"{trial}.csv"))
         assert findings == []
         np.testing.assert_allclose(log_table(log)[1], table, rtol=1e-8, atol=1e-7)
 
@@ -81,7 +81,7 @@ def test_units_and_order_of_the_file_do_not_matter(text):
 def test_template_is_valid_and_its_text_names_all_columns(tmp_path):
     path = tmp_path / "template.csv"
     words = template(path)
-    log, findings = read_log(path, strict=True)
+    log, findings = read_log(path)
     assert findings == [] and len(log) == 10
     assert not any(line.startswith("#") for line in path.read_text().splitlines())
     groups = {(c.group, c.kind): c.name for c in reversed(log_columns(9, 9, 3))}
