@@ -129,7 +129,8 @@ def _look(
     mujoco.mj_tendon(model, data)
     tip = data.site("tip")
     # A marker at the first spring of each section, at its thirds, from base to tip
-    marker_m, n_links = [], arm.structure.links_per_section
+    n_links = arm.structure.links_per_section
+    marker_m = []
     for section in range(arm.structure.n_sections):
         for third in range(1, MARKERS_PER_SECTION + 1):
             plate = section * n_links + round(third * n_links / MARKERS_PER_SECTION)

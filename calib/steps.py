@@ -162,8 +162,10 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
 
     With `printed` the network is the paper's, and the section shows the process beside it.
     """
+    spec = arm.spec
     # Settle the simulated arm at the lengths of the unloaded arm; a payload would move the tip
-    spec, poses, n_unsettled = arm.spec, _unloaded(measurements, arm.spec), 0
+    poses = _unloaded(measurements, spec)
+    n_unsettled = 0
     settled = simulate_poses(spec, poses.spring_m) if poses.n else None
     if settled is not None:
         n_unsettled = int(np.count_nonzero(~settled.valid))

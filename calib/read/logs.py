@@ -190,8 +190,9 @@ def _together(faults: list[RowFault]) -> list[RowFault]:
 
 def _finding(matrix: LogMatrix, fault: RowFault) -> Finding:
     rows = matrix.row[fault.mask]
-    lines, n_dropped = (int(rows[0]), int(rows[-1])), len(rows) if fault.drops else 0
-    return Finding(matrix.file, lines, fault.column, f"{len(rows)} x {fault.problem}", n_dropped)
+    n_dropped = len(rows) if fault.drops else 0
+    problem = f"{len(rows)} x {fault.problem}"
+    return Finding(matrix.file, (int(rows[0]), int(rows[-1])), fault.column, problem, n_dropped)
 
 
 def implausible(matrix: LogMatrix, spec: ArmSpec) -> list[Finding]:
@@ -228,13 +229,10 @@ def _implausible_column(column: Column, values: np.ndarray) -> str:
     by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
     if low <= got <= high or by_hand:
         return ""
-    factor = column.factor
-    fitting = [unit for unit, other in UNITS[column.kind].items() if low <= got / factor * other <= high]
+    units = UNITS[column.kind].items()
+    fitting = [unit for unit, factor in units if low <= got / column.factor * factor <= high]
     hint = f" (plausible in {' or '.join(fitting)})" if fitting else ""
-    expected = f"{low / factor:.4g} to {high / factor:.4g} {column.unit}"
-    return (
-        f"got a {what} of {got / factor:.4g} {column.unit}{hint}, expected {expected}: wrong unit or column"
-    )
+    return f"got a {what} of {_shown(column, got)}{hint}, expected {_range(column)}: wrong unit or column"
 
 
 def _implausible_size(matrix: LogMatrix, group: str) -> str:
@@ -245,16 +243,21 @@ def _implausible_size(matrix: LogMatrix, group: str) -> str:
     sizes = np.abs(matrix.values[:, chosen])
     sizes = sizes[np.isfinite(sizes)]
     largest = np.percentile(sizes, 99) if len(sizes) else 0.0
-    least, factor = PLAUSIBLE[column.kind].least, column.factor
+    least = PLAUSIBLE[column.kind].least
     if largest == 0.0 or largest >= least:
         return ""
-    got, expected = f"{largest / factor:.4g} {column.unit}", f"{least / factor:.4g} {column.unit} at least"
+    got, expected = _shown(column, largest), _shown(column, least)
     return f"got 99 % of the values below {got}, expected the largest to reach {expected}: wrong unit"
 
 
 def _shown(column: Column, value: float) -> str:
     """Format a value in the unit of the file."""
     return f"{value / column.factor:.6g} {column.unit}".removesuffix(" 1")
+
+
+def _range(column: Column) -> str:
+    low, high, *_ = PLAUSIBLE[column.kind]
+    return f"{_shown(column, low)} to {_shown(column, high)}"
 
 
 def _single_rows(matrix: LogMatrix) -> Iterator[RowFault]:
@@ -278,9 +281,8 @@ def _single_rows(matrix: LogMatrix) -> Iterator[RowFault]:
         low, high, *_ = PLAUSIBLE[column.kind]
         outside = finite & ((values < low) | (values > high))
         if outside.any():
-            expected = f"expected {_shown(column, low)} to {_shown(column, high)}"
-            first = _shown(column, values[outside][0])
-            yield RowFault(column.name, f"out of range, first {first}, {expected}", outside)
+            problem = f"out of range, first {_shown(column, values[outside][0])}, expected {_range(column)}"
+            yield RowFault(column.name, problem, outside)
 
 
 def _renewal(matrix: LogMatrix) -> Iterator[RowFault]:

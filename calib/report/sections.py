@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.changes import Changes
@@ -33,12 +32,11 @@ ENOUGH = 2.0  # held-out error over that of the calibration, from which there is
 
 
 def springs(fit: LineFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
-    """Show beta and delta of each spring.
+    """Show beta and delta of each spring, and the residuals.
 
     Args:
         fit: fitted springs.
-        calibrated_m (n, n_springs) [m]: lengths from the calibrated sensors.
-        length_m (n, n_springs) [m]: lengths measured at the same time.
+        calibrated_m, length_m (n, n_springs) [m]: lengths from the calibrated sensors, and measured.
         per_section: springs of a section, which are a row of the figure.
     """
     head = ("beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
@@ -67,7 +65,6 @@ def springs(fit: LineFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_se
 
 def chambers(fit: ChamberFit) -> Section:
     """Show stiffness, area and rest length of each chamber, the backbone, and the errors of the tip."""
-    # Tabulate the chambers, the backbone, the mounting and the errors.
     spec = fit.spec
     units = (
         ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
@@ -83,18 +80,13 @@ def chambers(fit: ChamberFit) -> Section:
     each = _numbered("chamber", head, *columns)
     parts = {BENDING: spec.backbone.bending_stiffness_nm_per_rad, BOND: spec.chambers.bonded_share}
     backbone = _parts(parts, fit.half_width_95)
-    mounting = _mounting(fit)
     errors = _errors(
         ("held-out poses, before", fit.held_out_before),
         ("held-out poses, calibrated", fit.held_out),
         ("poses of the fit, calibrated", fit.in_sample),
     )
-    # Draw the errors of the fit's poses and of the held-out ones.
-    figure, axes = _figure()
-    bins = np.linspace(0.0, np.nanquantile(fit.tip_error_mm, 0.99), _BINS).tolist()
-    axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
-    axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
-    _label(axes, "simulated to measured tip [mm]", "density")
+    held_out_mm, fit_mm = fit.tip_error_mm[fit.is_held_out], fit.tip_error_mm[~fit.is_held_out]
+    figure = _histogram("simulated to measured tip [mm]", {"fit": fit_mm, "held out": held_out_mm})
     row_uses = ", ".join(f"{count} {use}" for use, count in fit.rows.items() if count)
     kept = " and ".join(title.split(" [")[0] for name, title, _ in units if name in without_effect(spec))
     return Section(
@@ -104,7 +96,7 @@ def chambers(fit: ChamberFit) -> Section:
         "The fit is to all poses; the errors are of a fit without the held-out poses. "
         f"Rows of the logs: {row_uses}."
         + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
-        (each, backbone, mounting, errors),
+        (each, backbone, _mounting(fit), errors),
         fit.warnings,
         plain(fit, "spec", "poses", "is_held_out", "tip_error_mm")
         | {"values": values | parts | dataclasses.asdict(spec.mounting)},
@@ -131,7 +123,6 @@ def s2r(
         n_unsettled: number of other poses, at whose spring lengths the simulated arm did not settle.
         others: fits to the same poses that were not chosen.
     """
-    # The table of errors, and the histogram of the held-out ones.
     errors = _errors(
         ("held-out poses, simulated", fit.test_uncorrected),
         ("held-out poses, corrected", fit.test),
@@ -146,12 +137,11 @@ def s2r(
             )
         ),
     )
-    corrected = correct(fit.s2r, pose, spring_m)
-    figure, axes = _figure()
-    for label, poses in (("simulated", pose), ("corrected", corrected)):
-        distance_mm = np.linalg.norm((poses - real)[fit.held_out, :3], axis=1)
-        axes.hist(distance_mm, _BINS, alpha=0.5, label=label)
-    _label(axes, "distance to the real tip, held-out poses [mm]", "poses")
+    distances_mm = {
+        label: np.linalg.norm((poses - real)[fit.held_out, :3], axis=1)
+        for label, poses in (("simulated", pose), ("corrected", correct(fit.s2r, pose, spring_m)))
+    }
+    figure = _histogram("distance to the real tip, held-out poses [mm]", distances_mm)
     return Section(
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation settles at the logged lengths, and "
@@ -179,22 +169,21 @@ def with_pressures(
         widths_kg: accuracy of payloads, see `calib.fit.payload.payload_intervals`.
         known_kg: half-width beyond which the control loop does not believe a payload.
     """
+    none_g, largest_g = (1e3 * kg for kg in widths_kg)
+    hysteresis_kpa = float(held.held.hysteresis_kpa.max())
     text = (
         f" The pressures that hold these poses are {held.before_kpa:.2f} kPa off the simulated ones (RMS, "
         f"held-out poses), and {held.after_kpa:.2f} kPa with a process of each section, which expects "
-        f"{held.expected_kpa:.2f} kPa. A chamber that has grown holds up to "
-        f"{2.0 * held.held.hysteresis_kpa.max():.2f} kPa more than one that has shrunk to the same length."
-    )
-    figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
-    figures["hysteresis"] = float(held.held.hysteresis_kpa.max())
-    # The accuracy of payloads.
-    none_g, largest_g = (1e3 * kg for kg in widths_kg)
-    text += (
-        f" So the loop will know within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
+        f"{held.expected_kpa:.2f} kPa. A chamber that has grown holds up to {2.0 * hysteresis_kpa:.2f} kPa "
+        "more than one that has shrunk to the same length. "
+        f"So the loop will know within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
         f"the workspace's poses, and the largest payload within {largest_g:.0f} g at 95 % of them."
     )
-    widths = {"none, median": none_g, "largest, p95": largest_g}
-    data = {"held_pressures_rms_kpa": figures, "payload_half_width_g": widths}
+    figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
+    data = {
+        "held_pressures_rms_kpa": figures | {"hysteresis": hysteresis_kpa},
+        "payload_half_width_g": {"none, median": none_g, "largest, p95": largest_g},
+    }
     warnings = section.warnings
     if largest_g > 1e3 * known_kg:
         accuracy = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
@@ -290,11 +279,8 @@ def damping(fit: DampingFit, shape: ShapeFit | None) -> Section:
 def changes(fit: Changes, known_mm: float) -> Section:
     """Show what has changed, and whether that explains the later poses.
 
-    Args:
-        fit: fitted changes.
-        known_mm: mean error of the tip at held-out poses of the calibration, 0 if not known.
+    `known_mm` is the mean error of the tip at held-out poses of the calibration, 0 if not known.
     """
-    # Tables of the springs, the chambers and the errors
     errors = tuple(
         (what, tip.translation_mean_mm, tip.rotation_mean_deg, kpa)
         if tip.n
@@ -310,7 +296,6 @@ def changes(fit: Changes, known_mm: float) -> Section:
         ReportTable(("held-out poses", "tip [mm]", "turn [deg]", "pressures, RMS [kPa]"), errors),
     )
 
-    # A sentence for the terminal, and a warning where more has changed
     warnings: tuple[str, ...] = ()
     after_mm = fit.after.translation_mean_mm if fit.is_better else fit.before.translation_mean_mm
     if known_mm and after_mm > ENOUGH * known_mm:
@@ -343,10 +328,8 @@ def payloads(fit: PayloadScaleFit) -> Section:
         f"{estimate}. So a payload changes the pressures by {fit.factor:.3f} of the simulated change. Near "
         f"these poses this factor is known to {percent:.0f} % (95 %); other errors add to it."
     )
-    off = 100.0 * (fit.ratio - 1.0)
-    note = (
-        f"payloads were estimated {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
-    )
+    way = "heavy" if fit.ratio > 1.0 else "light"
+    note = f"payloads were estimated {100.0 * abs(fit.ratio - 1.0):.1f} % too {way}; this is corrected"
     return Section(PAYLOADS, text, data=fit._asdict(), notes=(note,))
 
 
@@ -398,12 +381,14 @@ def _errors(*rows: tuple[str, PoseErrors]) -> ReportTable:
     return ReportTable(head, tuple(shown))
 
 
-def _figure() -> tuple[Figure, Axes]:
+def _histogram(x_label: str, errors_mm: Mapping[str, np.ndarray]) -> Figure:
+    """Draw the densities of errors by their labels, up to where 1 % are larger."""
     figure = Figure(figsize=(7.5, 3.6), layout="constrained")
-    return figure, figure.add_subplot()
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set(xlabel=x, ylabel=y)
-    axes.legend(fontsize="small", ncols=3, loc="upper left")
+    axes = figure.add_subplot()
+    bins = np.linspace(0.0, np.nanquantile(np.concatenate([*errors_mm.values()]), 0.99), _BINS).tolist()
+    for label, values in errors_mm.items():
+        axes.hist(values, bins, density=True, alpha=0.5, label=label)
+    axes.set(xlabel=x_label, ylabel="density")
+    axes.legend(fontsize="small", loc="upper left")
     axes.grid(alpha=0.3)
+    return figure

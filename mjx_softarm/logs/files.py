@@ -134,8 +134,8 @@ def _absent(
     for group in needed:
         if group not in groups:
             first, *others = [column for column in known.values() if column.group == group]
-            expected = f"columns `{first.header}` to `{others[-1].name}`" if others else None
-            yield first.name, f"got nothing, expected {expected or f'a column `{first.header}`'}"
+            expected = f"columns `{first.header}` to `{others[-1].name}`" if others else f"`{first.header}`"
+            yield first.name, f"got nothing, expected {expected}"
     if one_of and not groups & set(one_of):
         firsts = [next(column for column in known.values() if column.group == group) for group in one_of]
         *most, last = [f"{column.name}.." for column in firsts]

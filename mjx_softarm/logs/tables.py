@@ -75,11 +75,9 @@ def _read_csv(path: Path) -> Table:
             continue
         cells = line.split(",")
         if len(cells) != len(names):
-            delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
-            commas = " (decimal commas?)" if len(cells) >= 1.5 * len(names) else ""
-            hint = f" and {delimiters[0]}" if delimiters else commas
-            got = f"got {len(cells)} cells{hint}"
-            raise _error(path, f"{got}, expected {len(names)} as in the header", number)
+            hint = " (decimal commas?)" if len(cells) >= 1.5 * len(names) else ""
+            problem = f"got {len(cells)} cells{hint}, expected {len(names)} as in the header"
+            raise _error(path, problem, number)
         numbers = np.full(len(cells), np.nan)
         for k, cell in enumerate(cells):
             try:
