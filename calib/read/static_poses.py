@@ -94,7 +94,7 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
     # Leave out rows that are not finite.
     if log.payload_kg is None:
         log = dataclasses.replace(log, payload_kg=np.full(len(log), spec.mass.payload_kg))
-    columns = [value for name in NEEDED if (value := getattr(log, name)) is not None]
+    columns = [value for name, value in log.groups.items() if name in NEEDED]
     finite = np.all(np.isfinite(np.column_stack(columns)), axis=1)
     row_uses["not finite"] += int(np.count_nonzero(~finite))
     log = log.take(finite)

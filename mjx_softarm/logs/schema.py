@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -109,15 +110,19 @@ class Log:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    @property
+    def groups(self) -> dict[str, np.ndarray]:
+        """Logged quantities by their fields, in the order of the file."""
+        return {name: value for name in GROUPS if (value := getattr(self, name)) is not None}
+
     def lengths_m(self, sensor: Sensor) -> np.ndarray | None:
         """Return the spring lengths (n, n_springs) [m]: by the readings, NaN where one is not believed."""
         return self.spring_m if self.readings is None else sensor.lengths(self.readings, np.nan).length_m
 
     def take(self, rows: np.ndarray) -> Log:
         """Return a log of some rows, given by indices or a mask (n,)."""
-        values = {name: getattr(self, name) for name in GROUPS}
-        kept = {name: None if value is None else value[rows] for name, value in values.items()}
-        return dataclasses.replace(self, row=self.row[rows], **kept)
+        groups: dict[str, Any] = {name: value[rows] for name, value in self.groups.items()}
+        return dataclasses.replace(self, row=self.row[rows], **groups)
 
 
 _NO_GROUPS = ("source", "row", "reading_name")
@@ -126,17 +131,16 @@ GROUPS = tuple(item.name for item in dataclasses.fields(Log) if item.name not in
 
 def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
     """Return the columns (k,) of a log, and its numbers (n, k) in the units of the columns."""
+    groups = log.groups
 
-    def width(*groups: str) -> int:
-        present = [value for name in groups if (value := getattr(log, name)) is not None]
-        return max((value.shape[1] for value in present), default=0)
+    def width(*names: str) -> int:
+        return max((groups[name].shape[1] for name in names if name in groups), default=0)
 
     n_springs = width("readings", "spring_m", "reference_m")
     n_chambers, n_markers = width("pressure_kpa", "commanded_kpa"), width("marker_m")
     known = log_columns(n_chambers, n_springs, n_markers, log.reading_name)
-    columns = tuple(column for column in known if getattr(log, column.group) is not None)
-    present = [value for name in GROUPS if (value := getattr(log, name)) is not None]
-    table = np.concatenate([np.reshape(value, (len(log), -1)) for value in present], axis=1)
+    columns = tuple(column for column in known if column.group in groups)
+    table = np.concatenate([np.reshape(value, (len(log), -1)) for value in groups.values()], axis=1)
     return columns, table / [column.factor for column in columns]
 
 

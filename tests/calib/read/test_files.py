@@ -16,7 +16,7 @@ UNREADABLE = {
     "UTF-16": (simple(moving(9)).encode("utf-16"), "UTF-16 text, expected UTF-8"),
     "UTF-16 without a mark": (simple(moving(9)).encode("utf-16-le"), "UTF-16 text, expected UTF-8"),
     "binary": (bytes(range(256)) * 40, "a binary file, expected CSV"),
-    "Latin-1": (simple(moving(9), HEADER + ",für").encode("latin-1"), "line 1: got byte 0xfc at 42"),
+    "Latin-1": (simple(moving(9), HEADER + ",für").encode("latin-1"), "line 1: got byte 0xfc at 40"),
     "late binary": ((simple(moving(4000)) + "\x00\x01,2,3,4\n").encode(), r"line 4002: time \[s\]: got"),
     "ragged": (simple([*moving(5), "0.1,0.2,0.3", *moving(9, 6)]), "line 7: got 3 cells, expected 4"),
     "word": (simple([*moving(5), "0.1,0.2,off,0.3"]), r"line 7: tip_y \[m\]: got 'off', expected a number"),

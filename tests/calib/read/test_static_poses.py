@@ -146,9 +146,9 @@ def test_a_log_of_the_loop_has_a_pose_at_each_arrival():
 
 def test_a_log_of_a_moving_goal_has_poses_at_its_stops_only():
     """Between the stops the springs are still by the loop's rule, as the goal moves slowly."""
-    slow = np.linspace(GOALS[0], GOALS[1], 3)
-    run = trace(LinearArm(), Controller.of(POLICY, between), slow, pace_s=20.0)
-    assert run.ways and len(run.log) > 1500
+    slow = np.linspace(GOALS[0], 0.75 * GOALS[0] + 0.25 * GOALS[1], 2)
+    run = trace(LinearArm(), Controller.of(POLICY, between), slow, pace_s=10.0)
+    assert run.ways and len(run.log) > 400
     poses, row_uses = find_static_poses([run.log], SPEC)
     assert poses.n == len(run.arrivals) == 2 and sum(row_uses.values()) == len(run.log)
     for k, arrival in enumerate(run.arrivals):
