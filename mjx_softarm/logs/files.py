@@ -5,6 +5,7 @@ A file that cannot be understood is refused. Each reader decides which rows to b
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import re
 from collections.abc import Iterator, Sequence
@@ -102,23 +103,28 @@ def refuse(findings: Sequence[Finding]) -> None:
         raise LogError(findings)
 
 
+def _stem(name: str) -> str:
+    """Return the name of a numbered column without its number, empty for another column."""
+    match = re.fullmatch(r"(\D+)\d+", name)
+    return match[1] if match else ""
+
+
 def _header_errors(names: list[str], units: dict, known: dict, sensor: Sensor) -> Iterator[tuple[str, str]]:
     """Yield the columns that do not fit the schema, each with its problem."""
-    reading_name, groups = sensor.reading_name, [known[name].group for name in names if name in known]
-    foreign = [name for name in names if name.rstrip("0123456789") in _READINGS - {reading_name}]
+    groups = [known[name].group for name in names if name in known]
+    foreign = [name for name in names if _stem(name) in _READINGS - {sensor.reading_name}]
     if foreign and "readings" not in groups:
-        yield foreign[0], f"got readings of another sensor, expected {reading_name} of a {sensor.kind}"
+        yield foreign[0], f"got readings of another sensor, expected {sensor.reading_name} of a {sensor.kind}"
+    n_columns = collections.Counter(map(_stem, known))
     for name, unit in units.items():
         if names.count(name) > 1:
             yield name, f"got {names.count(name)} columns of this name, expected one"
         if name in known and unit not in UNITS[known[name].kind]:
             expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
             yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
-        of_chamber = re.fullmatch(r"(pressure|commanded)\d+", name)
-        if name not in known and (of_chamber or re.fullmatch(rf"({reading_name}|spring|reference)\d+", name)):
-            part, group = ("chambers", "pressure_kpa") if of_chamber else ("springs", "spring_m")
-            n = sum(column.group == group for column in known.values())
-            yield name, f"got this column, expected those of {n} {part}, numbered from 0"
+        stem = _stem(name)
+        if stem and name not in known and stem in n_columns:
+            yield name, f"got this column, expected {stem}0 to {stem}{n_columns[stem] - 1}"
     for group in dict.fromkeys(groups):
         columns = [name for name, column in known.items() if column.group == group]
         if missing := [name for name in columns if name not in names]:

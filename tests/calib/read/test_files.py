@@ -26,7 +26,10 @@ UNREADABLE = {
     "part of a group": (simple(["0,1", "1,1"], "time [s],tip_x [m]"), "tip_y, tip_z: got no .* beside tip_x"),
     "twice": (simple([f"{r},1" for r in moving(4)], HEADER + ",tip_x [m]"), "tip_x: got 2 columns of this"),
     "no unit": (simple(moving(9), HEADER.replace(" [s]", "")), r"time: got no unit, expected one of \[s\]"),
-    "other arm": (simple(["0,1", "1,1"], "time [s],spring9 [mm]"), "spring9: got this column, expected"),
+    "other arm": (
+        simple(["0,1", "1,1"], "time [s],spring9 [mm]"),
+        "spring9: got this column, expected spring0",
+    ),
     "other sensor": (simple(["0,1", "1,1"], "time [s],voltage0 [V]"), "voltage0: got readings of another"),
 }
 

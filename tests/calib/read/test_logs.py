@@ -9,7 +9,7 @@ from calib.read.logs import read_log, template
 from calib.read.measurements import measure
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import UNITS, log_columns, log_table
-from tests.calib.read.arm_logs import N, arm_log, csv, planted
+from tests.calib.read.arm_logs import N, arm_log, csv
 
 
 @pytest.mark.parametrize("name", ["arm.csv", "arm.npz"])
@@ -103,6 +103,7 @@ def test_logs_of_one_arm_and_of_two(spec):
 
 
 def test_too_few_rows_left_are_refused_with_the_reasons(file):
-    path = file(**planted("spring_m", slice(1, None), np.nan, 0))
+    spring_m = arm_log().spring_m
+    spring_m[1:, 0] = np.nan
     with pytest.raises(LogError, match="spring0: 399 x NaN or inf.*\n.*1 rows left, expected 2 at least"):
-        read_log(path)
+        read_log(file(spring_m=spring_m))
