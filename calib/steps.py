@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -236,14 +235,3 @@ def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
     if not fit.is_plausible:
         return StepResult(arm, section)
     return StepResult(arm._replace(held=held._replace(factor=fit.factor, factor_sd=fit.factor_sd)), section)
-
-
-STEPS: Mapping[str, Step] = MappingProxyType(
-    {
-        "springs": springs,
-        "chambers": chambers,
-        "sim-to-real network": s2r,
-        "actuators": actuators,
-        "damping": damping,
-    }
-)

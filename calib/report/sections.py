@@ -163,11 +163,8 @@ def with_pressures(
 ) -> Section:
     """Add the residual pressures, before and after their fit, to the network's section.
 
-    Args:
-        section: section of the network.
-        held: fitted residual pressures.
-        widths_kg: accuracy of payloads, see `calib.fit.payload.payload_intervals`.
-        known_kg: half-width beyond which the control loop does not believe a payload.
+    Payloads are known to `widths_kg`, see `calib.fit.payload.payload_intervals`. The control loop believes
+    none that is known worse than `known_kg`.
     """
     none_g, largest_g = (1e3 * kg for kg in widths_kg)
     hysteresis_kpa = float(held.held.hysteresis_kpa.max())
