@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 from typing import NamedTuple
 
@@ -94,7 +95,7 @@ def _read_csv(path: Path) -> Table:
 
 def _text(path: Path) -> str:
     """Return the text of a file, or say which other kind of file it is."""
-    data = path.read_bytes()
+    data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     head = data[:_HEAD_BYTES]
     if not head.strip():
         raise _error(path, "got an empty file, expected a header and rows")
@@ -105,7 +106,7 @@ def _text(path: Path) -> str:
     if 0 in head:
         raise _error(path, "got a binary file, expected CSV text (or npz, by the end of its name)")
     try:
-        return data.decode("utf-8").removeprefix("\ufeff")
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         got = f"byte 0x{data[error.start]:02x} at {error.start}"

@@ -9,6 +9,7 @@ from tests.calib.read.arm_logs import HEADER, moving, simple
 
 UNREADABLE = {
     "empty": (b"", "empty file"),
+    "mark alone": (b"\xef\xbb\xbf", "empty file"),
     "one row": (simple(moving(1)), "got 1 row, expected 2 at least"),
     "all NaN": (simple([f"{0.1 * k},0.{k},nan,-0.6" for k in range(9)]), "tip_y: got no number in the whole"),
     "semicolons": (simple(moving(9)).replace(",", ";"), "line 1: .*got semicolons"),
