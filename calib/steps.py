@@ -215,7 +215,7 @@ def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
     spec, held = arm.spec, arm.held
     if held is None:
         remedy = f"no residual pressures: record {MIN_S2R_POSES} poses at rest or more, and calibrate anew"
-        return _not_fitted(arm, sections.PAYLOADS, "", remedy)
+        return _not_fitted(arm, sections.PAYLOADS, "The calibration has no residual pressures.", remedy)
     # Take heavy poses that the simulated arm holds.
     poses = measurements.poses.with_lengths(spec)
     poses = poses.take(np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1)))
