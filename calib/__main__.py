@@ -103,7 +103,6 @@ def _run(
         s2r: sim-to-real network: ours, which learns a Gaussian process, or the paper's as printed
         seed: seed of all random draws
     """
-    from calib import steps
     from calib.arm import CalibratedArm
     from calib.report.page import warning_lines
     from calib.run import Calibration, calibrate, go_on, refuse_existing, write_calibration
@@ -123,11 +122,11 @@ def _run(
         print(f"arm: {arm.name}, by default; --spec names another arm")
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
-    chosen = {**steps.STEPS, "sim-to-real network": functools.partial(steps.s2r, printed=s2r == "printed")}
     progress = functools.partial(print, flush=True)
-    calibration = (
-        go_on(known, read, seed, progress) if known else calibrate(read, arm, seed, chosen, progress)
-    )
+    if known:
+        calibration = go_on(known, read, seed, progress)
+    else:
+        calibration = calibrate(read, arm, seed, s2r == "printed", progress)
     # Write the folder, and print the reasons not to trust it.
     write_calibration(out, calibration, [str(finding) for finding in findings], provenance("calib"))
     lines = warning_lines(calibration.sections)
@@ -155,7 +154,7 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
         raise InputError("LOG: got nothing, expected one log or more")
     logs, findings = [], []
     for path in paths:
-        log, of_log = read_log(path, spec, strict)
+        log, of_log = read_log(path, spec)
         of_log = [*of_log, *(Finding(str(path), None, WIRING, fault) for fault in wiring_faults(log, spec))]
         if strict and of_log:
             raise LogError(of_log)

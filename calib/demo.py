@@ -8,7 +8,7 @@ of chambers and springs, and has finer links: this is left to the sim-to-real ne
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -66,7 +66,7 @@ def planted_arm(spec: ArmSpec, seed: int) -> ArmSpec:
 
 
 def write_demo(folder: Path, spec: ArmSpec, seed: int) -> list[Path]:
-    """Write a complete set of logs.
+    """Write a complete set of logs, and return their files.
 
     `springs.csv`: each spring on a ruler. `poses.csv`: the arm at rest at random pressures.
     `steps.csv`: the arm after steps of the pressures, at the control rate.
@@ -75,12 +75,6 @@ def write_demo(folder: Path, spec: ArmSpec, seed: int) -> list[Path]:
         folder: folder to write, created if it does not exist.
         spec: arm as the user believes it to be.
         seed: seed of the planted arm, the pressures and the noise.
-
-    Returns:
-        The files.
-
-    Raises:
-        OSError: the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     planted, rng = planted_arm(spec, seed), np.random.default_rng([seed, 1])
@@ -125,38 +119,28 @@ def _steps(arm: ArmSpec, rng: np.random.Generator) -> Log:
     return _measured(arm, period_s * np.arange(len(seen)), pressure_kpa, seen, rng)
 
 
-class _Seen(NamedTuple):
-    """Measurable quantities of an arm, without noise."""
-
-    spring_m: np.ndarray  # (n,)
-    tip_m: np.ndarray  # (3,)
-    tip_rotation: np.ndarray  # (3, 3)
-    marker_m: np.ndarray  # (n_markers, 3)
-
-
-def _look(arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> _Seen:
+def _look(
+    arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Return spring lengths (n,), tip (3,), its rotation (3, 3) and markers (n_markers, 3), without noise."""
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_tendon(model, data)
     tip = data.site("tip")
-    marker_m = np.stack([data.site(name).xpos for name in _marker_sites(arm)])
-    spring_m = spring_lengths(data, arm.n_chambers, arm.n_springs).copy()
-    return _Seen(spring_m, tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m)
-
-
-def _marker_sites(arm: ArmSpec) -> list[str]:
-    """Return sites of the markers: at the first spring of each section, at its thirds, from base to tip."""
-    per_section, names = arm.structure.links_per_section, []
+    # A marker at the first spring of each section, at its thirds, from base to tip
+    n_links = arm.structure.links_per_section
+    marker_m = []
     for section in range(arm.structure.n_sections):
         for third in range(1, MARKERS_PER_SECTION + 1):
-            plate = section * per_section + round(third * per_section / MARKERS_PER_SECTION)
-            names.append(f"spring{arm.springs_per_section * section}_plate{plate}")
-    return names
+            plate = section * n_links + round(third * n_links / MARKERS_PER_SECTION)
+            marker_m.append(data.site(f"spring{arm.springs_per_section * section}_plate{plate}").xpos)
+    spring_m = spring_lengths(data, arm.n_chambers, arm.n_springs).copy()
+    return spring_m, tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), np.stack(marker_m)
 
 
 def _measured(
-    arm: ArmSpec, time_s: np.ndarray, pressure_kpa: np.ndarray, seen: list[_Seen], rng: np.random.Generator
+    arm: ArmSpec, time_s: np.ndarray, pressure_kpa: np.ndarray, seen: list, rng: np.random.Generator
 ) -> Log:
     """Return a log of the measured quantities, with noise."""
     spring_m, tip_m, rotation, marker_m = map(np.stack, zip(*seen, strict=True))

@@ -11,17 +11,19 @@ The result is a folder that training takes:
 
 from __future__ import annotations
 
+import functools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from calib import steps
 from calib.arm import CalibratedArm
 from calib.read.measurements import Measurements, measure
 from calib.read.static_poses import SAME_KG
 from calib.report.page import Section, to_html, to_json
-from calib.steps import STEPS, Step, changes, payloads
+from calib.steps import Step
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ARM_FILE, ArmSpec
@@ -39,7 +41,7 @@ def calibrate(
     logs: Sequence[Log],
     spec: ArmSpec,
     seed: int = 0,
-    steps: Mapping[str, Step] = STEPS,
+    printed: bool = False,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit everything that the logs allow.
@@ -50,7 +52,7 @@ def calibrate(
         logs: logs of one arm, see `calib.read.logs.read_log`.
         spec: arm as believed so far.
         seed: seed of all random draws.
-        steps: steps by their names, in their order.
+        printed: fit the paper's sim-to-real network.
         progress: called with a line of text before each step.
 
     Raises:
@@ -59,10 +61,16 @@ def calibrate(
     """
     later = [log for log in logs if log.goal is not None]
     if 0 < len(later) < len(logs):
-        first = calibrate([log for log in logs if log.goal is None], spec, seed, steps, progress)
+        first = calibrate([log for log in logs if log.goal is None], spec, seed, printed, progress)
         return go_on(first, later, seed, progress)
-    start = Calibration(CalibratedArm(spec), ())
-    return _run_steps(start, steps, measure(logs, spec), seed, progress)
+    chosen: dict[str, Step] = {
+        "springs": steps.springs,
+        "chambers": steps.chambers,
+        "sim-to-real network": functools.partial(steps.s2r, printed=printed),
+        "actuators": steps.actuators,
+        "damping": steps.damping,
+    }
+    return _run_steps(Calibration(CalibratedArm(spec), ()), chosen, measure(logs, spec), seed, progress)
 
 
 def go_on(
@@ -81,20 +89,20 @@ def go_on(
     spec = since.arm.spec
     measurements = measure(later, spec, needed=("pressure_kpa",))
     loaded = measurements.poses.payload_kg > spec.mass.payload_kg + SAME_KG
-    steps: dict[str, Step] = {} if len(loaded) and loaded.all() else {"changes": changes}
-    steps |= {"payloads": payloads} if loaded.any() else {}
-    return _run_steps(since, steps, measurements, seed, progress)
+    chosen: dict[str, Step] = {} if len(loaded) and loaded.all() else {"changes": steps.changes}
+    chosen |= {"payloads": steps.payloads} if loaded.any() else {}
+    return _run_steps(since, chosen, measurements, seed, progress)
 
 
 def _run_steps(
     calibration: Calibration,
-    steps: Mapping[str, Step],
+    chosen: Mapping[str, Step],
     measurements: Measurements,
     seed: int,
     progress: Callable[[str], None],
 ) -> Calibration:
     """Return a calibration after further steps; each begins with the arm of the step before."""
-    for name, step in steps.items():
+    for name, step in chosen.items():
         progress(f"{name} ...")
         result = step(measurements, calibration.arm, seed)
         calibration = Calibration(result.arm, (*calibration.sections, result.section))
@@ -114,13 +122,7 @@ def refuse_existing(folder: Path) -> None:
 def write_calibration(
     folder: Path, calibration: Calibration, findings: Sequence[str], provenance: dict[str, Any]
 ) -> None:
-    """Write the folder, whole or not at all.
-
-    Args:
-        folder: folder to write.
-        calibration: what to write.
-        findings: faults of the logs, for the report.
-        provenance: versions, machine and commit, for the report.
+    """Write the folder, whole or not at all; the report has the logs' findings and the provenance.
 
     Raises:
         FileExistsError: the folder exists and is not empty.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +30,7 @@ from calib.fit.payload import (
     payload_intervals,
     payload_poses,
 )
-from calib.fit.s2r import SimulatedPoses, fit_s2r, simulate_poses
+from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.springs import fit_springs
 from calib.read.measurements import Measurements
 from calib.read.static_poses import SAME_KG, StaticPoses
@@ -45,7 +44,6 @@ from mjx_softarm.spec import ArmSpec, Unmodelled
 
 # Least number of poses of a network. From 49 poses of a rod it brought held-out tips from 10.4 to 2.6 mm.
 MIN_S2R_POSES = 40
-NOT_FITTED = "Not fitted: the specification's values stay."
 
 
 class StepResult(NamedTuple):
@@ -58,18 +56,42 @@ class StepResult(NamedTuple):
 Step = Callable[[Measurements, CalibratedArm, int], StepResult]
 
 
+def _not_fitted(
+    arm: CalibratedArm, title: str, why: str, *warnings: str, notes: tuple[str, ...] = ()
+) -> StepResult:
+    """Return the result of a step without enough data."""
+    text = f"Not fitted: the specification's values stay. {why}"
+    return StepResult(arm, Section(title, text, warnings=warnings, notes=notes))
+
+
+def _few(n_found: int, n: int, what: str, row_uses: Mapping[str, int]) -> str:
+    """Say which poses are needed, and what became of the rows of the logs."""
+    uses = ", ".join(f"{count} {use}" for use, count in row_uses.items() if count)
+    return (
+        f"Got {n_found} poses at rest with {what}, expected {n} or more; pressures must have been held for "
+        f"{MIN_HOLD_S:g} s. Rows of the logs: {uses or 'none with all of these columns'}."
+    )
+
+
+def _unloaded(measurements: Measurements, spec: ArmSpec) -> StaticPoses:
+    """Return the poses with spring lengths and no more than the specification's payload."""
+    poses = measurements.poses.with_lengths(spec)
+    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=SAME_KG)
+    return poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+
+
 def springs(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
     """Fit beta and delta of the springs' sensors."""
     spec = arm.spec
     pairs = [
-        (readings, log.spring_m)
+        (log.readings, log.spring_m)
         for log in measurements.logs
-        if (readings := log.readings_of(spec.sensor)) is not None and log.spring_m is not None
+        if log.readings is not None and log.spring_m is not None
     ]
     if not pairs:
-        needed = f"{NOT_FITTED} No log has both readings and measured spring lengths."
+        needed = "No log has both readings and measured spring lengths."
         remedy = "beta and delta are not this arm's: log readings beside spring lengths on a ruler"
-        return StepResult(arm, Section("Springs", needed, warnings=(remedy,)))
+        return _not_fitted(arm, "Springs", needed, remedy)
     readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
     fit = fit_springs(readings, length_m, spec.spring_sensor, seed)
     # Put the fitted numbers into the specification, and show the residuals.
@@ -83,9 +105,9 @@ def chambers(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
     """Fit stiffness, area and length of the chambers, the backbone and the mounting to poses at rest."""
     n = measurements.poses.n
     if n < MIN_POSES:
-        needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', n, measurements.row_uses)}"
+        few = _few(n, MIN_POSES, "pressures and tip poses", measurements.row_uses)
         remedy = f"stiffness, area and length are not this arm's: log {MIN_POSES} poses at rest or more"
-        return StepResult(arm, Section("Chambers", needed, warnings=(remedy,)))
+        return _not_fitted(arm, "Chambers", few, remedy)
     fit = fit_chambers(measurements, arm.spec, seed)
     return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, sections.chambers(fit))
 
@@ -94,8 +116,7 @@ def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> Step
     """Fit pumps or regulators to commanded and measured pressures, or to commands and springs."""
     spec = arm.spec
     tracks, lag = find_tracks(measurements.logs, spec), MEASURED
-    poses = measurements.poses.with_lengths(spec)
-    if not tracks and len(_unloaded(poses, spec)) >= MIN_POSES:
+    if not tracks and _unloaded(measurements, spec).n >= MIN_POSES:
         # No pressure was measured: the springs are the gauge, and the shape shows the arm's own lag
         tracks = find_tracks(measurements.logs, spec, functools.partial(pressures_by_springs, arm))
         shape = fit_shape(measurements.logs, arm) if tracks else None
@@ -109,7 +130,7 @@ def actuators(measurements: Measurements, arm: CalibratedArm, seed: int) -> Step
             "how fast pumps or regulators follow is not known. With slow ones a goal that moves is missed by "
             "up to 10 mm: `deploy record` logs what shows it"
         )
-        return StepResult(arm, Section("Actuators", f"{NOT_FITTED} {needed}", notes=(cost,)))
+        return _not_fitted(arm, "Actuators", needed, notes=(cost,))
     fit = fit_actuators(tracks, spec, seed, lag)
     return StepResult(arm._replace(spec=fit.spec), sections.actuators(fit))
 
@@ -126,7 +147,7 @@ def damping(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepRe
     stretches = find_stretches(measurements.logs, spec)
     if not stretches:
         needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
-        return StepResult(arm, Section("Damping", f"{NOT_FITTED} {needed}"))
+        return _not_fitted(arm, "Damping", needed)
     # The lag of the shape shows the backbone's damping by itself, if it is known well
     shape, bending = fit_shape(measurements.logs, arm), None
     if shape is not None and shape.is_known:
@@ -141,24 +162,27 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     With `printed` the network is the paper's, and the section shows the process beside it.
     """
     spec = arm.spec
-    at_rest = _settled_poses(measurements, spec)
-    if len(at_rest.rows) < MIN_S2R_POSES:
+    # Settle the simulated arm at the lengths of the unloaded arm; a payload would move the tip
+    poses = _unloaded(measurements, spec)
+    n_unsettled = 0
+    settled = simulate_poses(spec, poses.spring_m) if poses.n else None
+    if settled is not None:
+        n_unsettled = int(np.count_nonzero(~settled.valid))
+        poses, settled = poses.take(settled.valid), settled.take(settled.valid)
+    if settled is None or poses.n < MIN_S2R_POSES:
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
-        uses = {
-            **measurements.row_uses,
-            "poses at which the simulated arm finds no rest": at_rest.n_unsettled,
-        }
-        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, len(at_rest.rows), uses)}"
+        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": n_unsettled}
+        few = _few(poses.n, MIN_S2R_POSES, what, uses)
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
-        return StepResult(arm, Section("Sim-to-real network", needed, warnings=(remedy,)))
-    poses, rows, settled, real, n_unsettled = at_rest
+        return _not_fitted(arm, "Sim-to-real network", few, remedy)
+    real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     # Fit the network from simulated to measured tips.
     fit = fit_s2r(spec, settled, real, seed)
     others = (fit,) if printed else ()
     fit = fit_s2r(spec, settled, real, seed, printed=True) if printed else fit
     section = sections.s2r(fit, settled.pose, settled.spring_m, real, n_unsettled, others)
     # Fit the pressures that hold the arm.
-    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[rows], settled.pressure_kpa, seed)
+    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa, settled.pressure_kpa, seed)
     if fit.is_better:
         arm = arm._replace(s2r=fit.s2r)
     if not held.is_better:
@@ -172,40 +196,15 @@ def s2r(measurements: Measurements, arm: CalibratedArm, seed: int, printed: bool
     return StepResult(arm, section)
 
 
-class _SettledPoses(NamedTuple):
-    """Poses of the unloaded arm at whose spring lengths the simulated arm finds rest."""
-
-    poses: StaticPoses  # all static poses
-    rows: np.ndarray  # (n,) indices of the poses that settled
-    simulated: SimulatedPoses  # n poses
-    real: np.ndarray  # (n, 6) [mm, deg]
-    n_unsettled: int
-
-
-def _settled_poses(measurements: Measurements, spec: ArmSpec) -> _SettledPoses:
-    """Settle the simulated arm at the spring lengths of the unloaded arm; a payload would move the tip."""
-    poses = measurements.poses.with_lengths(spec)
-    rows = _unloaded(poses, spec)
-    # Without any pose, simulate one in vain: the arrays keep their shapes.
-    spring_m = poses.spring_m[rows] if len(rows) else np.ones((1, spec.n_springs))
-    simulated = simulate_poses(spec, spring_m)
-    settled = np.flatnonzero(simulated.valid[: len(rows)])
-    n_unsettled = len(rows) - len(settled)
-    rows = rows[settled]
-    real = pose_from_frame(poses.tip_m[rows], poses.tip_rotation[rows])
-    return _SettledPoses(poses, rows, simulated.take(settled), real, n_unsettled)
-
-
 def changes(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepResult:
     """Fit what has changed since an arm's calibration to later poses of the unloaded arm."""
     spec, s2r, _ = arm
-    poses = measurements.poses.with_lengths(spec)
-    poses = poses.take(_unloaded(poses, spec))
+    poses = _unloaded(measurements, spec)
     if poses.n < MIN_LATER:
         what = "pressures and spring lengths, without a payload"
-        needed = f"{NOT_FITTED} {_few(MIN_LATER, what, poses.n, measurements.row_uses)}"
+        few = _few(poses.n, MIN_LATER, what, measurements.row_uses)
         remedy = f"what has changed is not known: measure {MIN_LATER} goals or more"
-        return StepResult(arm, Section(sections.CHANGES, needed, warnings=(remedy,)))
+        return _not_fitted(arm, sections.CHANGES, few, remedy)
     fit = fit_changes(arm, poses, seed)
     section = sections.changes(fit, 0.0 if s2r is None else float(s2r.error_mm))
     return StepResult(arm._replace(spec=fit.spec) if fit.is_better else arm, section)
@@ -216,7 +215,7 @@ def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
     spec, held = arm.spec, arm.held
     if held is None:
         remedy = f"no residual pressures: record {MIN_S2R_POSES} poses at rest or more, and calibrate anew"
-        return StepResult(arm, Section(sections.PAYLOADS, NOT_FITTED, warnings=(remedy,)))
+        return _not_fitted(arm, sections.PAYLOADS, "The calibration has no residual pressures.", remedy)
     # Take heavy poses that the simulated arm holds.
     poses = measurements.poses.with_lengths(spec)
     poses = poses.take(np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1)))
@@ -226,39 +225,13 @@ def payloads(measurements: Measurements, arm: CalibratedArm, seed: int) -> StepR
         rows = rows[held_at(arm, poses.spring_m[rows])[1]]
     if len(rows) < MIN_WEIGHED:
         what = f"pressures and spring lengths, {1e3 * least_kg:.0f} g or more on top of the arm's own payload"
-        needed = f"{NOT_FITTED} {_few(MIN_WEIGHED, what, len(rows), measurements.row_uses)}"
+        few = _few(len(rows), MIN_WEIGHED, what, measurements.row_uses)
         got = f"got {len(rows)} poses with {1e3 * least_kg:.0f} g or more, expected {MIN_WEIGHED}"
         remedy = "measure more goals with a known weight (`deploy measure --payload`)"
-        return StepResult(arm, Section(sections.PAYLOADS, needed, warnings=(f"{got}: {remedy}",)))
+        return _not_fitted(arm, sections.PAYLOADS, few, f"{got}: {remedy}")
     # Fit them; a ratio that no arm has is not believed.
     fit = fit_payload_scale(arm, poses, rows)
     section = sections.payloads(fit)
     if not fit.is_plausible:
         return StepResult(arm, section)
     return StepResult(arm._replace(held=held._replace(factor=fit.factor, factor_sd=fit.factor_sd)), section)
-
-
-STEPS: Mapping[str, Step] = MappingProxyType(
-    {
-        "springs": springs,
-        "chambers": chambers,
-        "sim-to-real network": s2r,
-        "actuators": actuators,
-        "damping": damping,
-    }
-)
-
-
-def _unloaded(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
-    """Return the indices of the poses with spring lengths and no more than the specification's payload."""
-    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=SAME_KG)
-    return np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
-
-
-def _few(n: int, what: str, n_found: int, row_uses: Mapping[str, int]) -> str:
-    """Say which poses are needed, and what became of the rows of the logs."""
-    uses = ", ".join(f"{count} {use}" for use, count in row_uses.items() if count)
-    return (
-        f"Got {n_found} poses at rest with {what}, expected {n} or more; pressures must have been held for "
-        f"{MIN_HOLD_S:g} s. Rows of the logs: {uses or 'none with all of these columns'}."
-    )

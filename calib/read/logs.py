@@ -4,13 +4,13 @@
 unit) is refused. Otherwise each row is kept or dropped whole. Rows are checked in three stages, each on the
 rows that the stage before kept: single rows (NaN, time, range); rows beside the row before (motion capture
 that was not renewed or is turned); outliers. Only references, goals and estimates of the control loop may be
-NaN. Signs of quaternions are repaired. Columns
-that never change, time gaps and unknown columns are only reported. Each finding has the number of rows it
-dropped.
+NaN. Signs of quaternions are repaired. Columns that never change, time gaps and unknown columns are only
+reported. Each finding has the number of rows it dropped.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -39,32 +39,26 @@ One row per pose will do if the rows are more than 3 s apart.
 NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # a log has one of these at least
 
 
-def read_log(
-    path: str | Path, spec: ArmSpec | None = None, strict: bool = False
-) -> tuple[Log, list[Finding]]:
+def read_log(path: str | Path, spec: ArmSpec | None = None) -> tuple[Log, list[Finding]]:
     """Read a log, keep the rows that can be believed, and report the faults of the others.
 
     Args:
         path: CSV file, or npz file by its suffix.
-        spec: the arm, by default the paper's; a log of an arm with other numbers of chambers or springs is
-            refused.
-        strict: refuse a log with any finding.
+        spec: the arm, by default the paper's; a log of an arm with another sensor, or other numbers of
+            chambers or springs, is refused.
 
     Returns:
         The log, with finite numbers only, and the findings.
 
     Raises:
-        LogError: the log cannot be used or is refused; the message has a line for each finding.
+        LogError: the log cannot be used; the message has a line for each finding.
     """
     spec = spec or ArmSpec.default()
     matrix, findings = read_matrix(path, spec, one_of=NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
         refuse(implausible(matrix, spec))
         matrix, cleaning = clean(matrix)
-    findings += cleaning
-    if strict:
-        refuse(findings)
-    return matrix.log(), findings
+    return matrix.log(), findings + cleaning
 
 
 def template(path: str | Path) -> str:
@@ -99,24 +93,21 @@ def template(path: str | Path) -> str:
         payload_kg=np.zeros(10),
     )
     write_log(path, log)
-    return schema_text(spec.n_chambers, spec.n_springs, n_sections)
+    return _schema_text(spec)
 
 
-def schema_text(n_chambers: int, n_springs: int, n_markers: int) -> str:
-    """Describe the columns that a log may have, from the schema."""
+def _schema_text(spec: ArmSpec) -> str:
+    """Describe the columns that a log of an arm may have, with a marker on each section."""
     lines = [_HELP, f"{'columns':<30} {'units':<26} plausible"]
-    groups: dict[tuple[str, str], list[Column]] = {}
-    names = [sensor.reading_name for sensor in SENSORS.values()]
-    counts = n_chambers, n_springs, n_markers
-    for column in dict.fromkeys(c for name in names for c in log_columns(*counts, name)):
-        groups.setdefault((column.group, column.kind), []).append(column)
-    for columns in groups.values():
-        first, last = columns[0], columns[-1]
-        names = first.name if first == last else f"{first.name} .. {last.name}"
-        units = list(UNITS[first.kind])
-        bounds = PLAUSIBLE[quantity(first)]
-        steps = " between rows" if first.kind == "time" else ""
-        plausible = f"{bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
+    counts = spec.n_chambers, spec.n_springs, spec.structure.n_sections
+    columns = dict.fromkeys(
+        column for sensor in SENSORS.values() for column in log_columns(*counts, sensor.reading_name)
+    )
+    for (_, kind), (first, *others) in itertools.groupby(columns, lambda column: (column.group, column.kind)):
+        names = f"{first.name} .. {others[-1].name}" if others else first.name
+        units = list(UNITS[kind])
+        steps = " between rows" if kind == "time" else ""
+        plausible = f"{PLAUSIBLE[kind].low:g} to {PLAUSIBLE[kind].high:g} {units[0]}{steps}"
         lines.append(f"{names:<30} {', '.join(units):<26} {plausible}")
     return "\n".join(lines)
 
@@ -149,6 +140,7 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
 )
 BY_HAND_ROWS = 300  # fewer rows may be poses that were recorded by hand
 BY_HAND_S = 600.0  # longest median step of poses that were recorded by hand
+MOVES_M = 1e-3  # range of positions up to which a body may be frozen
 ALONG_M = 0.05  # least median distance of the tip from the base, along the straight arm
 FROM_LOOP = ("reference_m", "goal", "estimate", "load_kg")  # columns of the control loop; may hold NaN
 MEASURED = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
@@ -161,13 +153,11 @@ class RowFault(NamedTuple):
     problem: str
     mask: np.ndarray  # (n,)
     drops: bool = True
-    counted: bool = True  # the finding begins with the number of rows
 
 
 def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
     """Return the rows that can be believed, with quaternion signs repaired, and all findings."""
-    findings = [_finding(matrix, fault) for fault in _gaps(matrix)]
-    # Drop rows stage by stage.
+    findings = []
     for stage in (_single_rows, _renewal, _neighbours):
         faults = _together([fault for fault in stage(matrix) if fault.mask.any()])
         findings += [_finding(matrix, fault) for fault in faults]
@@ -198,23 +188,10 @@ def _together(faults: list[RowFault]) -> list[RowFault]:
     ]
 
 
-def _gaps(matrix: LogMatrix) -> Iterator[RowFault]:
-    """Find rows missing in the file, by its times."""
-    time_s = matrix.values[:, 0]
-    finite = np.flatnonzero(np.isfinite(time_s))
-    ordered = finite[~checks.late_rows(time_s[finite])]
-    gap = np.zeros(len(time_s), bool)
-    gap[ordered] = checks.gap_rows(time_s[ordered])
-    if gap.any():
-        steps_s = np.diff(time_s[ordered])
-        expected = f"expected steps near {np.median(steps_s):.4g} s"
-        yield RowFault("time", f"gap, longest {steps_s.max():.4g} s, {expected}", gap, drops=False)
-
-
 def _finding(matrix: LogMatrix, fault: RowFault) -> Finding:
     rows = matrix.row[fault.mask]
-    problem = f"{len(rows)} x {fault.problem}" if fault.counted else fault.problem
     n_dropped = len(rows) if fault.drops else 0
+    problem = f"{len(rows)} x {fault.problem}"
     return Finding(matrix.file, (int(rows[0]), int(rows[-1])), fault.column, problem, n_dropped)
 
 
@@ -222,11 +199,10 @@ def implausible(matrix: LogMatrix, spec: ArmSpec) -> list[Finding]:
     """Find reasons to refuse the log: columns without numbers, or that contradict their header or the arm."""
     if len(matrix.row) < 2:
         return [Finding(matrix.file, None, "", f"got {len(matrix.row)} row, expected 2 at least")]
-    problems = {}
-    for k, column in enumerate(matrix.columns):
-        problems[column.name] = _implausible_column(column, matrix.values[:, k])
-    for group in dict.fromkeys(column.group for column in matrix.columns[1:]):
-        problems[group] = _implausible_size(matrix, group)
+    columns = zip(matrix.columns, matrix.values.T, strict=True)
+    problems = {column.name: _implausible_column(column, values) for column, values in columns}
+    groups = dict.fromkeys(column.group for column in matrix.columns[1:])
+    problems |= {group: _implausible_size(matrix, group) for group in groups}
     if tip := matrix.indices("tip_m"):
         along_m = _typical(matrix.values[:, tip] @ -posture(spec)[:, 2])
         if along_m < ALONG_M:
@@ -249,43 +225,39 @@ def _implausible_column(column: Column, values: np.ndarray) -> str:
     if not np.isfinite(values).any():
         return "" if column.group in FROM_LOOP else "got no number in the whole column, expected some"
     got = _typical(np.diff(values) if column.kind == "time" else values)
-    low, high, *_ = PLAUSIBLE[quantity(column)]
+    low, high, *_ = PLAUSIBLE[column.kind]
     by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
     if low <= got <= high or by_hand:
         return ""
-    factors = UNITS[column.kind]
-    factor = factors[column.unit]
-    fitting = [unit for unit, other in factors.items() if low <= got / factor * other <= high]
+    units = UNITS[column.kind].items()
+    fitting = [unit for unit, factor in units if low <= got / column.factor * factor <= high]
     hint = f" (plausible in {' or '.join(fitting)})" if fitting else ""
-    expected = f"{low / factor:.4g} to {high / factor:.4g} {column.unit}"
-    return (
-        f"got a {what} of {got / factor:.4g} {column.unit}{hint}, expected {expected}: wrong unit or column"
-    )
-
-
-def quantity(column: Column) -> str:
-    """Return the key of a column in `PLAUSIBLE`."""
-    return "position" if column.group in ("tip_m", "marker_m") else column.kind
+    return f"got a {what} of {_shown(column, got)}{hint}, expected {_range(column)}: wrong unit or column"
 
 
 def _implausible_size(matrix: LogMatrix, group: str) -> str:
-    chosen = [k for k in matrix.indices(group) if PLAUSIBLE[quantity(matrix.columns[k])].least > 0.0]
+    chosen = [k for k in matrix.indices(group) if PLAUSIBLE[matrix.columns[k].kind].least > 0.0]
     if not chosen:
         return ""
     column = matrix.columns[chosen[0]]
     sizes = np.abs(matrix.values[:, chosen])
     sizes = sizes[np.isfinite(sizes)]
     largest = np.percentile(sizes, 99) if len(sizes) else 0.0
-    least, factor = PLAUSIBLE[quantity(column)].least, UNITS[column.kind][column.unit]
+    least = PLAUSIBLE[column.kind].least
     if largest == 0.0 or largest >= least:
         return ""
-    got, expected = f"{largest / factor:.4g} {column.unit}", f"{least / factor:.4g} {column.unit} at least"
+    got, expected = _shown(column, largest), _shown(column, least)
     return f"got 99 % of the values below {got}, expected the largest to reach {expected}: wrong unit"
 
 
 def _shown(column: Column, value: float) -> str:
     """Format a value in the unit of the file."""
-    return f"{value / UNITS[column.kind][column.unit]:.6g} {column.unit}".removesuffix(" 1")
+    return f"{value / column.factor:.6g} {column.unit}".removesuffix(" 1")
+
+
+def _range(column: Column) -> str:
+    low, high, *_ = PLAUSIBLE[column.kind]
+    return f"{_shown(column, low)} to {_shown(column, high)}"
 
 
 def _single_rows(matrix: LogMatrix) -> Iterator[RowFault]:
@@ -298,13 +270,19 @@ def _single_rows(matrix: LogMatrix) -> Iterator[RowFault]:
             late = np.zeros(len(values), bool)
             late[finite] = checks.late_rows(values[finite])
             yield RowFault("time", "repeated or going back, expected times that increase", late)
+            ordered = np.flatnonzero(finite & ~late)
+            gap = np.zeros(len(values), bool)
+            gap[ordered] = checks.gap_rows(values[ordered])
+            if gap.any():
+                steps_s = np.diff(values[ordered])
+                expected = f"expected steps near {np.median(steps_s):.4g} s"
+                yield RowFault("time", f"gap, longest {steps_s.max():.4g} s, {expected}", gap, drops=False)
             continue
-        low, high, *_ = PLAUSIBLE[quantity(column)]
+        low, high, *_ = PLAUSIBLE[column.kind]
         outside = finite & ((values < low) | (values > high))
         if outside.any():
-            expected = f"expected {_shown(column, low)} to {_shown(column, high)}"
-            first = _shown(column, values[outside][0])
-            yield RowFault(column.name, f"out of range, first {first}, {expected}", outside)
+            problem = f"out of range, first {_shown(column, values[outside][0])}, expected {_range(column)}"
+            yield RowFault(column.name, problem, outside)
 
 
 def _renewal(matrix: LogMatrix) -> Iterator[RowFault]:
@@ -312,19 +290,19 @@ def _renewal(matrix: LogMatrix) -> Iterator[RowFault]:
     for k in matrix.indices("readings", "spring_m", "pressure_kpa"):
         if np.ptp(matrix.values[:, k]) == 0.0:
             always = _shown(matrix.columns[k], matrix.values[0, k])
-            problem = f"got always {always}, expected a sensor that changes"
-            yield RowFault(matrix.columns[k].name, problem, everywhere, drops=False, counted=False)
-    for name, axes in matrix.bodies():
-        body = matrix.values[:, axes]
-        if checks.moves(body):
+            problem = f"the same value, {always}, expected a sensor that changes"
+            yield RowFault(matrix.columns[k].name, problem, everywhere, drops=False)
+    for axes in np.reshape(matrix.indices("tip_m", "marker_m"), (-1, 3)).astype(int):
+        name, body = matrix.columns[axes[0]].name[:-2], matrix.values[:, axes]
+        if np.ptp(body, axis=0).max() > MOVES_M:
             # A quaternion that changes shows that the tip was seen, though its position stays.
             seen = matrix.indices("tip_quaternion") if name == "tip" else []
             stale = checks.stale_rows(matrix.values[:, [*axes, *seen]])
             problem = "equal to the row before, expected motion capture renewed in each row"
             yield RowFault(f"{name}_x..z", problem, stale)
         elif name == "tip":
-            problem = "got a tip that never moves by 1 mm, expected one that moves"
-            yield RowFault("tip_x..z", problem, everywhere, drops=False, counted=False)
+            problem = "the same place to 1 mm, expected a tip that moves"
+            yield RowFault("tip_x..z", problem, everywhere, drops=False)
     if quaternion := matrix.indices("tip_quaternion"):
         values = matrix.values[:, quaternion]
         wrong = checks.not_unit_rows(values)
@@ -339,9 +317,8 @@ def _renewal(matrix: LogMatrix) -> Iterator[RowFault]:
 def _neighbours(matrix: LogMatrix) -> Iterator[RowFault]:
     for k in matrix.indices(*MEASURED):
         column = matrix.columns[k]
-        outlier = checks.outlier_rows(matrix.values[:, k], PLAUSIBLE[quantity(column)].spike)
+        outlier = checks.outlier_rows(matrix.values[:, k], PLAUSIBLE[column.kind].spike)
         if outlier.any():
             first = _shown(column, matrix.values[outlier, k][0])
-            yield RowFault(
-                column.name, f"outlier, first {first}, expected a value like its neighbours", outlier
-            )
+            problem = f"outlier, first {first}, expected a value like its neighbours"
+            yield RowFault(column.name, problem, outlier)

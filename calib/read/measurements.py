@@ -40,7 +40,7 @@ def measure(logs: Sequence[Log], spec: ArmSpec, needed: Sequence[str] = POSE_COL
     for first, other in itertools.combinations(logs, 2):
         file = f"{first.source} and {other.source}"
         refuse([Finding(file, None, name, problem) for name, problem in _differences(first, other)])
-    with_poses = [log for log in logs if all(getattr(log, name) is not None for name in needed)]
+    with_poses = [log for log in logs if log.groups.keys() >= set(needed)]
     return Measurements(tuple(logs), *find_static_poses(with_poses, spec))
 
 

@@ -8,6 +8,7 @@ Two equal goals in a row are one goal of the log, and give one pose.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -66,9 +67,6 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
 
     Returns:
         The poses, and the number of rows by use. A log with readings gives no spring lengths, but readings.
-
-    Raises:
-        LogError: a log has readings of another kind of sensor.
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     row_uses = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
@@ -94,41 +92,43 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
 def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str, int]) -> list[tuple]:
     """Return the fields of each pose of a log, its rows of readings last; count the rows by use."""
     # Leave out rows that are not finite.
-    payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
-    columns = [value for name in NEEDED if (value := getattr(log, name)) is not None]
+    if log.payload_kg is None:
+        log = dataclasses.replace(log, payload_kg=np.full(len(log), spec.mass.payload_kg))
+    columns = [value for name, value in log.groups.items() if name in NEEDED]
     finite = np.all(np.isfinite(np.column_stack(columns)), axis=1)
     row_uses["not finite"] += int(np.count_nonzero(~finite))
-    log, payload = log.take(finite), payload[finite]
-    assert log.pressure_kpa is not None
+    log = log.take(finite)
+    assert log.pressure_kpa is not None and log.payload_kg is not None
+
     # Fill what the log does not have.
-    unknown = np.full((len(log), spec.n_springs), np.nan)
-    readings = log.readings_of(spec.sensor)
-    springs = unknown if readings is not None or log.spring_m is None else log.spring_m
-    readings = unknown if readings is None else readings
-    markers = np.full((len(log), n_markers, 3), np.nan)
-    if log.marker_m is not None and log.marker_m.shape[1] == n_markers:
-        markers = log.marker_m
-    tips, rotation = np.full((len(log), 3), np.nan), np.full((len(log), 3, 3), np.nan)
+    def or_nan(value: np.ndarray | None, *shape: int) -> np.ndarray:
+        return np.full((len(log), *shape), np.nan) if value is None else value
+
+    readings = or_nan(log.readings, spec.n_springs)
+    springs = or_nan(log.spring_m if log.readings is None else None, spec.n_springs)
+    same_markers = log.marker_m is not None and log.marker_m.shape[1] == n_markers
+    markers = or_nan(log.marker_m if same_markers else None, n_markers, 3)
+    tips, rotation = or_nan(None, 3), or_nan(None, 3, 3)
     if log.tip_m is not None and log.tip_quaternion is not None:
         tips, rotation = log.tip_m, rotation_from_quaternion(log.tip_quaternion)
     # Average the rows at each rest.
     poses = []
     rests = _rests if log.goal is None else _rests_of_loop
-    for rows in rests(log, payload, spec, row_uses):
+    for rows in rests(log, spec, row_uses):
         row_uses["used"] += len(rows)
         pressure, tip, turn, spring, marker = (
             np.mean(x[rows], axis=0) for x in (log.pressure_kpa, tips, rotation, springs, markers)
         )
-        kept = payload[rows[0]]  # the payload of all rows, which a mean would round
+        payload = log.payload_kg[rows[0]]  # of all rows; a mean would round it
         turn = nearest_rotation(turn) if np.isfinite(turn).all() else turn
-        poses.append((pressure, kept, tip, turn, spring, marker, readings[rows]))
+        poses.append((pressure, payload, tip, turn, spring, marker, readings[rows]))
     return poses
 
 
-def _rests(log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, int]) -> Iterator[np.ndarray]:
+def _rests(log: Log, spec: ArmSpec, row_uses: dict[str, int]) -> Iterator[np.ndarray]:
     """Find the rows of each rest: the last second of a hold at whose end the tip rests."""
-    assert log.pressure_kpa is not None
-    for start, stop in holds(log.time_s, log.pressure_kpa, payload_kg):
+    assert log.pressure_kpa is not None and log.payload_kg is not None
+    for start, stop in holds(log.time_s, log.pressure_kpa, log.payload_kg):
         rows = last_second(log.time_s, start, stop)
         row_uses["pressures not held long enough"] += stop - start - len(rows)
         moving = len(rows) > 0 and log.tip_m is not None and moves(log.time_s[rows], log.tip_m[rows])
@@ -137,16 +137,13 @@ def _rests(log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, 
             yield rows
 
 
-def _rests_of_loop(
-    log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, int]
-) -> Iterator[np.ndarray]:
+def _rests_of_loop(log: Log, spec: ArmSpec, row_uses: dict[str, int]) -> Iterator[np.ndarray]:
     """Find the rows of each rest in a log of the control loop: the last window of each goal that stood."""
-    assert log.goal is not None
+    assert log.goal is not None and log.payload_kg is not None
     n, still_m, _ = rest_rule(spec, _lag_s(spec))
-    readings = log.readings_of(spec.sensor)
-    watched_m = log.spring_m if readings is None else spec.spring_sensor.lengths(readings, np.nan).length_m
+    watched_m = log.lengths_m(spec.spring_sensor)
     # A goal that stands for a window, and no longer than the payload; a moving goal has no such rows
-    asked = np.column_stack([log.goal, payload_kg])
+    asked = np.column_stack([log.goal, log.payload_kg])
     cuts = np.flatnonzero((asked[1:] != asked[:-1]).any(axis=1)) + 1
     for rows in np.split(np.arange(len(log)), cuts):
         if len(rows) < n or np.isnan(log.goal[rows[0]]).any():

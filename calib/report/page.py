@@ -93,19 +93,19 @@ def _png(figure: Figure) -> str:
 
 
 def plain(fit: Any, *left_out: str) -> dict[str, Any]:
-    """Return the fields of a fit as JSON has them."""
+    """Return the fields of a fit, a named tuple or a dataclass, without its warnings."""
     fields = fit._asdict() if hasattr(fit, "_asdict") else vars(fit)
-    return {name: as_json(value) for name, value in fields.items() if name not in (*left_out, "warnings")}
+    return {name: value for name, value in fields.items() if name not in (*left_out, "warnings")}
 
 
 def as_json(value: Any) -> Any:
     """Return a value as JSON has it: null for a number that is not known."""
     if hasattr(value, "_asdict") or dataclasses.is_dataclass(value):
-        return plain(value)
+        value = plain(value)
     if isinstance(value, Mapping):
         return {name: as_json(item) for name, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
-        return as_json(value.tolist())
+        value = value.tolist()
     if isinstance(value, (list, tuple)):
         return [as_json(item) for item in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

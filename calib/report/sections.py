@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.changes import Changes
@@ -21,7 +20,7 @@ from calib.fit.payload import MOST_OFF, PayloadScaleFit
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
 from calib.fit.springs import LineFit
-from calib.report.page import ReportTable, Section, as_json, plain
+from calib.report.page import ReportTable, Section, plain
 from mjx_softarm._support.fields import PerSection
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.sensing.load import QUANTILE
@@ -33,24 +32,18 @@ ENOUGH = 2.0  # held-out error over that of the calibration, from which there is
 
 
 def springs(fit: LineFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
-    """Show beta and delta of each spring.
+    """Show beta and delta of each spring, and the residuals.
 
     Args:
         fit: fitted springs.
-        calibrated_m (n, n_springs) [m]: lengths from the calibrated sensors.
-        length_m (n, n_springs) [m]: lengths measured at the same time.
+        calibrated_m, length_m (n, n_springs) [m]: lengths from the calibrated sensors, and measured.
         per_section: springs of a section, which are a row of the figure.
     """
-    # Tabulate the fit.
-    beta, delta_mm, held_out_mm = fit.slope, 1e3 * fit.offset, 1e3 * fit.held_out_rms
-    rows = tuple(
-        (f"spring {k}", beta[k], fit.slope_width[k], delta_mm[k], 1e3 * fit.offset_width[k])
-        + (held_out_mm[k], int(fit.n_rows[k]), int(fit.n_outliers[k]))
-        for k in range(len(beta))
-    )
-    head = ("", "beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
+    head = ("beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
+    columns = fit.slope, fit.slope_width, 1e3 * fit.offset, 1e3 * fit.offset_width, 1e3 * fit.held_out_rms
+    table = _numbered("spring", head, *columns, fit.n_rows, fit.n_outliers)
     # Draw the residuals of each spring.
-    n_rows = len(beta) // per_section
+    n_rows = len(fit.slope) // per_section
     figure = Figure(figsize=(7.5, 1.0 + 1.6 * n_rows), layout="constrained")
     each = figure.subplots(n_rows, per_section, sharex=True, sharey=True, squeeze=False)
     for k, axes in enumerate(each.flat):
@@ -63,7 +56,7 @@ def springs(fit: LineFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_se
         "Springs",
         "Measured lengths L against lengths l from the readings, L = beta l + delta, by Huber's loss. "
         "Intervals are 95 %; contiguous blocks of rows are held out.",
-        (ReportTable(head, rows),),
+        (table,),
         fit.warnings,
         plain(fit),
         (("residuals of the lines", figure),),
@@ -72,7 +65,6 @@ def springs(fit: LineFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_se
 
 def chambers(fit: ChamberFit) -> Section:
     """Show stiffness, area and rest length of each chamber, the backbone, and the errors of the tip."""
-    # Tabulate the chambers, the backbone, the mounting and the errors.
     spec = fit.spec
     units = (
         ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
@@ -81,30 +73,20 @@ def chambers(fit: ChamberFit) -> Section:
         ("length_offset_m", "rest length [mm]", 1e3),
     )
     values = {name: spec.per_chamber(getattr(spec.chambers, name)) for name, _, _ in units}
-    rows = []
-    for k in range(spec.n_chambers):
-        pairs = (
-            (factor * values[name][k], float(factor * fit.half_width_95[name][k]))
-            for name, _, factor in units
-        )
-        rows.append((f"chamber {k}", *(number for pair in pairs for number in pair)))
-    head = ("", *(text for _, title, _ in units for text in (title, "+-")))
-    bending = spec.backbone.bending_stiffness_nm_per_rad
-    parts = ((BENDING, bending), (BOND, spec.chambers.bonded_share))
-    rows_of = (row for name, value in parts for row in per_part(name, value, fit.half_width_95[name]))
-    backbone = ReportTable(("", "value", "+-"), tuple(rows_of))
-    mounting = _mounting(fit)
+    head, columns = [], []
+    for name, title, factor in units:
+        head += [title, "+-"]
+        columns += [np.multiply(factor, values[name]), factor * fit.half_width_95[name]]
+    each = _numbered("chamber", head, *columns)
+    parts = {BENDING: spec.backbone.bending_stiffness_nm_per_rad, BOND: spec.chambers.bonded_share}
+    backbone = _parts(parts, fit.half_width_95)
     errors = _errors(
         ("held-out poses, before", fit.held_out_before),
         ("held-out poses, calibrated", fit.held_out),
         ("poses of the fit, calibrated", fit.in_sample),
     )
-    # Draw the errors of the fit's poses and of the held-out ones.
-    figure, axes = _figure()
-    bins = np.linspace(0.0, np.nanquantile(fit.tip_error_mm, 0.99), _BINS).tolist()
-    axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
-    axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
-    _label(axes, "simulated to measured tip [mm]", "density")
+    held_out_mm, fit_mm = fit.tip_error_mm[fit.is_held_out], fit.tip_error_mm[~fit.is_held_out]
+    figure = _histogram("simulated to measured tip [mm]", {"fit": fit_mm, "held out": held_out_mm})
     row_uses = ", ".join(f"{count} {use}" for use, count in fit.rows.items() if count)
     kept = " and ".join(title.split(" [")[0] for name, title, _ in units if name in without_effect(spec))
     return Section(
@@ -114,34 +96,13 @@ def chambers(fit: ChamberFit) -> Section:
         "The fit is to all poses; the errors are of a fit without the held-out poses. "
         f"Rows of the logs: {row_uses}."
         + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
-        (ReportTable(head, tuple(rows)), backbone, mounting, errors),
+        (each, backbone, _mounting(fit), errors),
         fit.warnings,
         plain(fit, "spec", "poses", "is_held_out", "tip_error_mm")
-        | {"values": values | dict(parts) | dataclasses.asdict(spec.mounting)},
+        | {"values": values | parts | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
         fit.notes,
     )
-
-
-def per_part(name: str, value: PerSection, width: Any) -> tuple[tuple[str, float, float], ...]:
-    """Return rows of a table: one for a number, one for each number of a list."""
-    if not isinstance(value, tuple):
-        return ((name, value, float(width)),)
-    return tuple((f"{name} {k}", x, float(w)) for k, (x, w) in enumerate(zip(value, width, strict=True)))
-
-
-def _mounting(fit: ChamberFit) -> ReportTable:
-    """Return the table of the arm's mounting, with intervals."""
-    rows = []
-    for name, values in dataclasses.asdict(fit.spec.mounting).items():
-        unit, factor = ("deg", 1.0) if name.endswith("_deg") else ("mm", 1e3)
-        what = name.removesuffix("_deg").removesuffix("_m").replace("_", " ")
-        labels = range(len(values)) if "section" in name else "xyz"
-        rows += [
-            (f"{what} {label} [{unit}]", factor * value, float(factor * width))
-            for label, value, width in zip(labels, values, fit.half_width_95[name], strict=True)
-        ]
-    return ReportTable(("", "value", "+-"), tuple(rows))
 
 
 def s2r(
@@ -162,7 +123,6 @@ def s2r(
         n_unsettled: number of other poses, at whose spring lengths the simulated arm did not settle.
         others: fits to the same poses that were not chosen.
     """
-    # The table of errors, and the histogram of the held-out ones.
     errors = _errors(
         ("held-out poses, simulated", fit.test_uncorrected),
         ("held-out poses, corrected", fit.test),
@@ -177,12 +137,11 @@ def s2r(
             )
         ),
     )
-    corrected = correct(fit.s2r, pose, spring_m)
-    figure, axes = _figure()
-    for label, poses in (("simulated", pose), ("corrected", corrected)):
-        distance_mm = np.linalg.norm((poses - real)[fit.held_out, :3], axis=1)
-        axes.hist(distance_mm, _BINS, alpha=0.5, label=label)
-    _label(axes, "distance to the real tip, held-out poses [mm]", "poses")
+    distances_mm = {
+        label: np.linalg.norm((poses - real)[fit.held_out, :3], axis=1)
+        for label, poses in (("simulated", pose), ("corrected", correct(fit.s2r, pose, spring_m)))
+    }
+    figure = _histogram("distance to the real tip, held-out poses [mm]", distances_mm)
     return Section(
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation settles at the logged lengths, and "
@@ -204,28 +163,24 @@ def with_pressures(
 ) -> Section:
     """Add the residual pressures, before and after their fit, to the network's section.
 
-    Args:
-        section: section of the network.
-        held: fitted residual pressures.
-        widths_kg: accuracy of payloads, see `calib.fit.payload.payload_intervals`.
-        known_kg: half-width beyond which the control loop does not believe a payload.
+    Payloads are known to `widths_kg`, see `calib.fit.payload.payload_intervals`. The control loop believes
+    none that is known worse than `known_kg`.
     """
+    none_g, largest_g = (1e3 * kg for kg in widths_kg)
+    hysteresis_kpa = float(held.held.hysteresis_kpa.max())
     text = (
         f" The pressures that hold these poses are {held.before_kpa:.2f} kPa off the simulated ones (RMS, "
         f"held-out poses), and {held.after_kpa:.2f} kPa with a process of each section, which expects "
-        f"{held.expected_kpa:.2f} kPa. A chamber that has grown holds up to "
-        f"{2.0 * held.held.hysteresis_kpa.max():.2f} kPa more than one that has shrunk to the same length."
-    )
-    figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
-    figures["hysteresis"] = float(held.held.hysteresis_kpa.max())
-    # The accuracy of payloads.
-    none_g, largest_g = (1e3 * kg for kg in widths_kg)
-    text += (
-        f" So the loop will know within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
+        f"{held.expected_kpa:.2f} kPa. A chamber that has grown holds up to {2.0 * hysteresis_kpa:.2f} kPa "
+        "more than one that has shrunk to the same length. "
+        f"So the loop will know within {none_g:.0f} g (95 %) that nothing hangs at the gripper, at half of "
         f"the workspace's poses, and the largest payload within {largest_g:.0f} g at 95 % of them."
     )
-    widths = {"none, median": none_g, "largest, p95": largest_g}
-    data = {"held_pressures_rms_kpa": figures, "payload_half_width_g": widths}
+    figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
+    data = {
+        "held_pressures_rms_kpa": figures | {"hysteresis": hysteresis_kpa},
+        "payload_half_width_g": {"none, median": none_g, "largest, p95": largest_g},
+    }
     warnings = section.warnings
     if largest_g > 1e3 * known_kg:
         accuracy = f"the largest payload known to {largest_g:.0f} g, expected {1e3 * known_kg:.0f} g"
@@ -235,16 +190,17 @@ def with_pressures(
 
 def actuators(fit: ActuatorFit) -> Section:
     """Show the numbers of the actuators and the errors of the pressures."""
-    # A row for each chamber: its numbers, with intervals where they were fitted, and its error
-    kept, n = fit.spec.actuators, fit.spec.n_chambers
-    each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(kept).items()}
-    widths = fit.half_width_95 if isinstance(kept, Regulator) else {}
-    rows = []
-    for k in range(n):
-        pairs = ((value[k], widths[name][k]) if widths else (value[k],) for name, value in each.items())
-        numbers = [x for pair in pairs for x in pair]
-        rows.append((f"chamber {k}", *map(float, [*numbers, fit.chamber_rms_kpa[k]])))
-    titles = [text for name in each for text in ((name, "+-") if widths else (name,))]
+    # The numbers of each chamber, with intervals where they were fitted, and its error
+    kept = fit.spec.actuators
+    values = dataclasses.asdict(kept)
+    head, columns = [], []
+    for name, value in values.items():
+        head.append(name)
+        columns.append(np.full(fit.spec.n_chambers, value, float))
+        if isinstance(kept, Regulator):
+            head.append("+-")
+            columns.append(fit.half_width_95[name])
+    each = _numbered("chamber", [*head, "held-out RMS [kPa]"], *columns, fit.chamber_rms_kpa)
 
     # Errors of each kind of actuator, then the section
     against = "measured pressures"
@@ -262,12 +218,9 @@ def actuators(fit: ActuatorFit) -> Section:
         f"{fit.n_tracks} tracks of commands and pressures, {fit.time_s:.0f} s in all: "
         f"{kept.kind}s driven with the commands against the {against}. Intervals are 95 %. "
         f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s). {_kept(fit)}",
-        (
-            ReportTable(("", *titles, "held-out RMS [kPa]"), tuple(rows)),
-            ReportTable(("pressures", "RMS [kPa]"), errors),
-        ),
+        (each, ReportTable(("pressures", "RMS [kPa]"), errors)),
         fit.warnings,
-        plain(fit, "spec", "notes") | {"kind": kept.kind, "values": as_json(dataclasses.asdict(kept))},
+        plain(fit, "spec", "notes") | {"kind": kept.kind, "values": values},
         notes=fit.notes,
     )
 
@@ -286,52 +239,45 @@ def _kept(fit: ActuatorFit) -> str:
     return text
 
 
-def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
+def damping(fit: DampingFit, shape: ShapeFit | None) -> Section:
     """Show damping of chambers and backbone, the lag of the shape, and the errors of the moving tip."""
     values = {
         "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
         "bending_damping_nms_per_rad": fit.spec.backbone.bending_damping_nms_per_rad,
     }
-    rows = [row for name in values for row in per_part(name, values[name], fit.half_width_95[name])]
     errors = (
         ("held-out seconds, before", fit.held_out_before_rms_mm),
         ("held-out seconds, calibrated", fit.held_out_rms_mm),
         ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
     )
-    tables = [ReportTable(("", "value", "+-"), tuple(rows)), ReportTable(("tip", "RMS [mm]"), errors)]
-    # The shape's lag, where it could be fitted
-    warnings, lag = fit.warnings, {}
-    if shape is not None:
+    tables = [_parts(values, fit.half_width_95), ReportTable(("tip", "RMS [mm]"), errors)]
+    warnings, lag = fit.warnings, None
+    if shape is not None:  # it could be fitted
         width = shape.half_width_s if np.isfinite(shape.half_width_s) else "not known"
         fitted = "fitted", shape.lag_s, width, shape.rms_mm
         lags = ("before", shape.before_s, "", shape.before_rms_mm), fitted
         tables.append(ReportTable(("lag of the shape behind the springs", "s", "+-", "tip, RMS [mm]"), lags))
-        lag = plain(shape, "spec") | {"half_width_s": as_json(shape.half_width_s)}
-    if shape is not None and shape.at_end:
-        warnings += (
-            f"the best lag of the shape, {shape.lag_s:.2g} s, is an end of those tried, and is not used: log "
-            "quicker motion, or check that times of springs and tip agree",
-        )
+        lag = plain(shape, "spec") | {"half_width_s": shape.half_width_s}
+        if shape.at_end:
+            warnings += (
+                f"the best lag of the shape, {shape.lag_s:.2g} s, is an end of those tried, and is not used: "
+                "log quicker motion, or check that times of springs and tip agree",
+            )
     return Section(
         "Damping",
         f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
         "measured pressures against the measured tip. Intervals are 95 %.",
         tuple(tables),
         warnings,
-        plain(fit, "spec") | {"values": values, "shape": lag or None},
+        plain(fit, "spec") | {"values": values, "shape": lag},
     )
 
 
 def changes(fit: Changes, known_mm: float) -> Section:
     """Show what has changed, and whether that explains the later poses.
 
-    Args:
-        fit: fitted changes.
-        known_mm: mean error of the tip at held-out poses of the calibration, 0 if not known.
+    `known_mm` is the mean error of the tip at held-out poses of the calibration, 0 if not known.
     """
-    # Tables of the springs, the chambers and the errors
-    springs = _rows("spring", 1e3 * fit.zero_m, 1e3 * fit.zero_half_width_m)
-    chambers = _rows("chamber", 100 * fit.stiffness, fit.offset_kpa)
     errors = tuple(
         (what, tip.translation_mean_mm, tip.rotation_mean_deg, kpa)
         if tip.n
@@ -342,12 +288,11 @@ def changes(fit: Changes, known_mm: float) -> Section:
         )
     )
     tables = (
-        ReportTable(("", "zero [mm]", "+-"), springs),
-        ReportTable(("", "stiffness [%]", "pressure [kPa]"), chambers),
+        _numbered("spring", ("zero [mm]", "+-"), 1e3 * fit.zero_m, 1e3 * fit.zero_half_width_m),
+        _numbered("chamber", ("stiffness [%]", "pressure [kPa]"), 100 * fit.stiffness, fit.offset_kpa),
         ReportTable(("held-out poses", "tip [mm]", "turn [deg]", "pressures, RMS [kPa]"), errors),
     )
 
-    # A sentence for the terminal, and a warning where more has changed
     warnings: tuple[str, ...] = ()
     after_mm = fit.after.translation_mean_mm if fit.is_better else fit.before.translation_mean_mm
     if known_mm and after_mm > ENOUGH * known_mm:
@@ -380,15 +325,9 @@ def payloads(fit: PayloadScaleFit) -> Section:
         f"{estimate}. So a payload changes the pressures by {fit.factor:.3f} of the simulated change. Near "
         f"these poses this factor is known to {percent:.0f} % (95 %); other errors add to it."
     )
-    off = 100.0 * (fit.ratio - 1.0)
-    note = (
-        f"payloads were estimated {abs(off):.1f} % too {'heavy' if off > 0.0 else 'light'}; this is corrected"
-    )
+    way = "heavy" if fit.ratio > 1.0 else "light"
+    note = f"payloads were estimated {100.0 * abs(fit.ratio - 1.0):.1f} % too {way}; this is corrected"
     return Section(PAYLOADS, text, data=fit._asdict(), notes=(note,))
-
-
-def _rows(name: str, *columns: np.ndarray) -> tuple[tuple[Any, ...], ...]:
-    return tuple((f"{name} {k}", *map(float, row)) for k, row in enumerate(zip(*columns, strict=True)))
 
 
 def _sentence(fit: Changes) -> str:
@@ -404,18 +343,49 @@ def _sentence(fit: Changes) -> str:
     return f"{what}; tips at held-out poses {before_mm:.1f} mm off before, {after_mm:.1f} mm now"
 
 
+def _numbered(name: str, head: Sequence[str], *columns: np.ndarray) -> ReportTable:
+    """Return a table with a row for each spring or chamber."""
+    rows = (tuple(numbers) for numbers in zip(*columns, strict=True))
+    return ReportTable(("", *head), tuple((f"{name} {k}", *row) for k, row in enumerate(rows)))
+
+
+def _parts(values: Mapping[str, PerSection], half_width_95: Mapping[str, Any]) -> ReportTable:
+    """Return a table of numbers with intervals, each a row, or a row for each section."""
+    rows = []
+    for name, value in values.items():
+        names = [f"{name} {k}" for k in range(len(value))] if isinstance(value, tuple) else [name]
+        rows += zip(names, np.atleast_1d(value), np.atleast_1d(half_width_95[name]), strict=True)
+    return ReportTable(("", "value", "+-"), tuple(rows))
+
+
+def _mounting(fit: ChamberFit) -> ReportTable:
+    """Return the table of the arm's mounting, with intervals."""
+    rows = []
+    for name, values in dataclasses.asdict(fit.spec.mounting).items():
+        unit, factor = ("deg", 1.0) if name.endswith("_deg") else ("mm", 1e3)
+        what = name.removesuffix("_deg").removesuffix("_m").replace("_", " ")
+        labels = range(len(values)) if "section" in name else "xyz"
+        rows += [
+            (f"{what} {label} [{unit}]", factor * value, float(factor * width))
+            for label, value, width in zip(labels, values, fit.half_width_95[name], strict=True)
+        ]
+    return ReportTable(("", "value", "+-"), tuple(rows))
+
+
 def _errors(*rows: tuple[str, PoseErrors]) -> ReportTable:
     head = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
     shown = ((what, e.n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for what, e in rows)
     return ReportTable(head, tuple(shown))
 
 
-def _figure() -> tuple[Figure, Axes]:
+def _histogram(x_label: str, errors_mm: Mapping[str, np.ndarray]) -> Figure:
+    """Draw the densities of errors by their labels, up to where 1 % are larger."""
     figure = Figure(figsize=(7.5, 3.6), layout="constrained")
-    return figure, figure.add_subplot()
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set(xlabel=x, ylabel=y)
-    axes.legend(fontsize="small", ncols=3, loc="upper left")
+    axes = figure.add_subplot()
+    bins = np.linspace(0.0, np.nanquantile(np.concatenate([*errors_mm.values()]), 0.99), _BINS).tolist()
+    for label, values in errors_mm.items():
+        axes.hist(values, bins, density=True, alpha=0.5, label=label)
+    axes.set(xlabel=x_label, ylabel="density")
+    axes.legend(fontsize="small", loc="upper left")
     axes.grid(alpha=0.3)
+    return figure

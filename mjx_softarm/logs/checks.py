@@ -36,7 +36,6 @@ class LogError(InputError):
 
 
 _UNIT_TOLERANCE = 0.01  # error of a quaternion's length
-_MOVES_M = 1e-3  # range of positions up to which a body may be frozen
 _TURN_DEG = 150.0  # smallest step of orientation that counts as a jump by 180 degrees
 _MOTION_DEG = 15.0  # largest median step of one motion; with larger steps, rows are separate poses
 _SPIKE_SIGMA = 20.0  # smallest deviation of a spike, in standard deviations of the column
@@ -47,11 +46,6 @@ _GAP_STEPS = 10.0  # smallest gap, in median time steps
 def stale_rows(values: np.ndarray) -> np.ndarray:
     """Mask (n,) the rows of (n, k) that equal the row before: readings that were not renewed."""
     return np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
-
-
-def moves(position_m: np.ndarray) -> bool:
-    """Return whether a body (n, 3) [m] leaves its place in a log."""
-    return bool(np.ptp(position_m, axis=0).max(initial=0.0) > _MOVES_M)
 
 
 def not_unit_rows(quaternion: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ A file that cannot be understood is refused. Each reader decides which rows to b
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import re
 from collections.abc import Iterator, Sequence
@@ -17,9 +18,10 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.schema import GROUPS, TABLES, UNITS, Column, Log, log_columns
 from mjx_softarm.logs.tables import read_table
-from mjx_softarm.sensing.sensors import SENSORS
+from mjx_softarm.sensing.sensors import SENSORS, Sensor
 from mjx_softarm.spec import ArmSpec
 
+_READINGS = {sensor.reading_name for sensor in SENSORS.values()}
 _CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
 
 
@@ -34,12 +36,6 @@ class LogMatrix(NamedTuple):
     def indices(self, *groups: str) -> list[int]:
         """Return the indices of the columns of these fields of `Log`."""
         return [k for k, column in enumerate(self.columns) if column.group in groups]
-
-    def bodies(self) -> Iterator[tuple[str, list[int]]]:
-        """Yield the names of tip and markers, each with the indices of its coordinates."""
-        columns = self.indices("tip_m", "marker_m")
-        for start in range(0, len(columns), 3):
-            yield self.columns[columns[start]].name[:-2], columns[start : start + 3]
 
     def log(self) -> Log:
         """Return the columns as a log."""
@@ -62,34 +58,31 @@ def read_matrix(
     spec: ArmSpec,
     needed: Sequence[str] = (),
     one_of: Sequence[str] = (),
-    reading_name: str | None = None,
 ) -> tuple[LogMatrix, list[Finding]]:
     """Read the known columns of a file; unknown columns are findings.
 
     Args:
         path: CSV file, or an npz file with the suffix `.npz`.
-        spec: the arm; a log of an arm with other numbers of chambers or springs is refused.
+        spec: the arm; a log of an arm with another sensor, or other numbers of chambers or springs, is
+            refused.
         needed: fields of `Log` whose columns are required, besides time.
         one_of: fields of `Log`; the columns of at least one are required.
-        reading_name: name of the readings of the arm's sensors; by default the first name in the file.
 
     Raises:
         LogError: the file cannot be understood; the message has a line for each finding.
     """
     # Split the header into names and units.
     file, table = str(path), read_table(path)
-    matches = [_CELL.fullmatch(cell) for cell in table.names]
-    names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
-    units = {name: match[2] if match else None for name, match in zip(names, matches, strict=True)}
+    cells = [(m[1], m[2]) if (m := _CELL.fullmatch(cell)) else (cell, None) for cell in table.names]
+    names, units = [name for name, _ in cells], dict(cells)
     markers = [int(match[1]) for name in names if (match := re.fullmatch(r"marker(\d+)_[xyz]", name))]
     n_markers = min(1 + max(markers, default=-1), len(names))
-    reading_name = reading_name or _reading_name(names)
-    columns = log_columns(spec.n_chambers, spec.n_springs, n_markers, reading_name)
+    columns = log_columns(spec.n_chambers, spec.n_springs, n_markers, spec.sensor.reading_name)
     known = {column.name: column for column in columns}
 
     # Refuse headers that do not fit the arm.
     if any(name[:1].isalpha() for name in names):
-        problems = [*_header_errors(names, units, known, reading_name)]
+        problems = [*_header_errors(names, units, known, spec.sensor)]
         problems += _absent(names, known, ("time_s", *needed), one_of)
     else:
         got = ", ".join(names)[:60]
@@ -99,7 +92,7 @@ def read_matrix(
     present = [column for name, column in known.items() if name in names]
     columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
     values = table.values[:, [names.index(column.name) for column in columns]]
-    values *= [UNITS[column.kind][column.unit] for column in columns]
+    values *= [column.factor for column in columns]
     extra = [Finding(file, (1, 1), name, "unknown column, ignored") for name in names if name not in known]
     return LogMatrix(file, columns, values, table.row), extra
 
@@ -110,28 +103,29 @@ def refuse(findings: Sequence[Finding]) -> None:
         raise LogError(findings)
 
 
-def _reading_name(names: list[str]) -> str:
-    """Return the name of a file's readings, or that of the default arm if the file has no readings."""
-    known = [sensor.reading_name for sensor in SENSORS.values()]
-    return next((x for x in known if any(re.fullmatch(rf"{x}\d+", name) for name in names)), known[0])
+def _stem(name: str) -> str:
+    """Return the name of a numbered column without its number, empty for another column."""
+    match = re.fullmatch(r"(\D+)\d+", name)
+    return match[1] if match else ""
 
 
-def _header_errors(
-    names: list[str], units: dict, known: dict, reading_name: str
-) -> Iterator[tuple[str, str]]:
+def _header_errors(names: list[str], units: dict, known: dict, sensor: Sensor) -> Iterator[tuple[str, str]]:
     """Yield the columns that do not fit the schema, each with its problem."""
+    groups = [known[name].group for name in names if name in known]
+    foreign = [name for name in names if _stem(name) in _READINGS - {sensor.reading_name}]
+    if foreign and "readings" not in groups:
+        yield foreign[0], f"got readings of another sensor, expected {sensor.reading_name} of a {sensor.kind}"
+    n_columns = collections.Counter(map(_stem, known))
     for name, unit in units.items():
         if names.count(name) > 1:
             yield name, f"got {names.count(name)} columns of this name, expected one"
         if name in known and unit not in UNITS[known[name].kind]:
             expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
             yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
-        of_chamber = re.fullmatch(r"(pressure|commanded)\d+", name)
-        if name not in known and (of_chamber or re.fullmatch(rf"({reading_name}|spring|reference)\d+", name)):
-            part, group = ("chambers", "pressure_kpa") if of_chamber else ("springs", "spring_m")
-            n = sum(column.group == group for column in known.values())
-            yield name, f"got this column, expected those of {n} {part}, numbered from 0"
-    for group in {known[name].group for name in names if name in known}:
+        stem = _stem(name)
+        if stem and name not in known and stem in n_columns:
+            yield name, f"got this column, expected {stem}0 to {stem}{n_columns[stem] - 1}"
+    for group in dict.fromkeys(groups):
         columns = [name for name, column in known.items() if column.group == group]
         if missing := [name for name in columns if name not in names]:
             beside = next(name for name in columns if name in names)
@@ -146,8 +140,8 @@ def _absent(
     for group in needed:
         if group not in groups:
             first, *others = [column for column in known.values() if column.group == group]
-            expected = f"columns `{first.header}` to `{others[-1].name}`" if others else None
-            yield first.name, f"got nothing, expected {expected or f'a column `{first.header}`'}"
+            expected = f"columns `{first.header}` to `{others[-1].name}`" if others else f"`{first.header}`"
+            yield first.name, f"got nothing, expected {expected}"
     if one_of and not groups & set(one_of):
         firsts = [next(column for column in known.values() if column.group == group) for group in one_of]
         *most, last = [f"{column.name}.." for column in firsts]

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from mjx_softarm._support.files import replacing
-from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.sensing.sensors import SENSORS, Coil, Sensor
 
 # Kind of quantity -> units of a file, each with its factor to the internal unit, which comes first.
@@ -23,6 +23,7 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
         "time": {"s": 1.0, "ms": 1e-3},
         "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
+        "position": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
         "pressure": {"kPa": 1.0, "Pa": 1e-3, "bar": 100.0, "mbar": 0.1, "psi": 6.894757293168},
         "mass": {"kg": 1.0, "g": 1e-3},
         "number": {"1": 1.0},
@@ -50,6 +51,11 @@ class Column:
     def header(self) -> str:
         return f"{self.name} [{self.unit}]"
 
+    @property
+    def factor(self) -> float:
+        """Factor from the file's unit to the internal one."""
+        return UNITS[self.kind][self.unit]
+
 
 def log_columns(
     n_chambers: int, n_springs: int, n_markers: int = 0, reading_name: str = Coil.reading_name
@@ -63,9 +69,9 @@ def log_columns(
         *(Column("spring_m", f"spring{k}", "length", "mm") for k in springs),
         *(Column("pressure_kpa", f"pressure{k}", "pressure", "kPa") for k in chambers),
         *(Column("commanded_kpa", f"commanded{k}", "pressure", "kPa") for k in chambers),
-        *(Column("tip_m", f"tip_{axis}", "length", "mm") for axis in _XYZ),
+        *(Column("tip_m", f"tip_{axis}", "position", "mm") for axis in _XYZ),
         *(Column("tip_quaternion", f"tip_q{part}", "number", "1") for part in "wxyz"),
-        *(Column("marker_m", f"marker{k}_{axis}", "length", "mm") for k in markers for axis in _XYZ),
+        *(Column("marker_m", f"marker{k}_{axis}", "position", "mm") for k in markers for axis in _XYZ),
         Column("payload_kg", "payload", "mass", "g"),
         *(Column("reference_m", f"reference{k}", "length", "mm") for k in springs),
         *(Column("goal", f"goal_{axis}", *_POSE[axis]) for axis in _POSE),
@@ -104,23 +110,19 @@ class Log:
     def __len__(self) -> int:
         return len(self.time_s)
 
-    def readings_of(self, sensor: Sensor) -> np.ndarray | None:
-        """Return the readings of an arm with this sensor, or None without readings.
+    @property
+    def groups(self) -> dict[str, np.ndarray]:
+        """Logged quantities by their fields, in the order of the file."""
+        return {name: value for name in GROUPS if (value := getattr(self, name)) is not None}
 
-        Raises:
-            LogError: the readings are of another kind of sensor.
-        """
-        if self.readings is not None and self.reading_name != sensor.reading_name:
-            expected = f"expected {sensor.reading_name} of a {sensor.kind}"
-            problem = f"got readings of {self.reading_name}, {expected}"
-            raise LogError([Finding(self.source, None, f"{self.reading_name}0", problem)])
-        return self.readings
+    def lengths_m(self, sensor: Sensor) -> np.ndarray | None:
+        """Return the spring lengths (n, n_springs) [m]: by the readings, NaN where one is not believed."""
+        return self.spring_m if self.readings is None else sensor.lengths(self.readings, np.nan).length_m
 
     def take(self, rows: np.ndarray) -> Log:
         """Return a log of some rows, given by indices or a mask (n,)."""
-        values = {name: getattr(self, name) for name in GROUPS}
-        kept = {name: None if value is None else value[rows] for name, value in values.items()}
-        return dataclasses.replace(self, row=self.row[rows], **kept)
+        groups: dict[str, Any] = {name: value[rows] for name, value in self.groups.items()}
+        return dataclasses.replace(self, row=self.row[rows], **groups)
 
 
 _NO_GROUPS = ("source", "row", "reading_name")
@@ -129,16 +131,17 @@ GROUPS = tuple(item.name for item in dataclasses.fields(Log) if item.name not in
 
 def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
     """Return the columns (k,) of a log, and its numbers (n, k) in the units of the columns."""
-    per_spring = [getattr(log, name) for name in ("readings", "spring_m", "reference_m")]
-    n_springs = max((value.shape[1] for value in per_spring if value is not None), default=0)
-    per_chamber = [log.pressure_kpa, log.commanded_kpa]
-    n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
-    n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]
+    groups = log.groups
+
+    def width(*names: str) -> int:
+        return max((groups[name].shape[1] for name in names if name in groups), default=0)
+
+    n_springs = width("readings", "spring_m", "reference_m")
+    n_chambers, n_markers = width("pressure_kpa", "commanded_kpa"), width("marker_m")
     known = log_columns(n_chambers, n_springs, n_markers, log.reading_name)
-    columns = tuple(column for column in known if getattr(log, column.group) is not None)
-    present = [value for name in GROUPS if (value := getattr(log, name)) is not None]
-    table = np.concatenate([np.reshape(value, (len(log), -1)) for value in present], axis=1)
-    return columns, table / np.array([UNITS[c.kind][c.unit] for c in columns])
+    columns = tuple(column for column in known if column.group in groups)
+    table = np.concatenate([np.reshape(value, (len(log), -1)) for value in groups.values()], axis=1)
+    return columns, table / [column.factor for column in columns]
 
 
 def write_log(path: str | Path, log: Log) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,10 +63,7 @@ def _read_npz(path: Path) -> Table:
 
 def _read_csv(path: Path) -> Table:
     # Header: the first line names the columns.
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
-    _check_text(path, head)
-    first = head.decode("utf-8-sig", errors="replace").splitlines()[0]
+    first, *lines = _text(path).splitlines()
     names = tuple(name.strip() for name in first.split(","))
     if "," not in first:
         delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
@@ -73,32 +71,32 @@ def _read_csv(path: Path) -> Table:
         raise _error(path, f"got {got}, expected columns parted by commas, and decimal points", 1)
     # Lines: blank ones are skipped, empty cells are NaN, any other text is an error.
     values, row = [], []
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            if number == 1 or not line.strip():
-                continue
-            cells = line.rstrip("\r\n").split(",")
-            if len(cells) != len(names):
-                delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
-                commas = " (decimal commas?)" if len(cells) >= 1.5 * len(names) else ""
-                hint = f" and {delimiters[0]}" if delimiters else commas
-                got = f"got {len(cells)} cells{hint}"
-                raise _error(path, f"{got}, expected {len(names)} as in the header", number)
-            numbers = np.full(len(cells), np.nan)
-            for k, cell in enumerate(cells):
-                try:
-                    numbers[k] = float(cell) if cell.strip() else np.nan
-                except ValueError:
-                    problem = f"got {cell.strip()[:40]!r}, expected a number"
-                    raise _error(path, problem, number, names[k]) from None
-            values.append(numbers)
-            row.append(number)
+    for number, line in enumerate(lines, 2):
+        if not line.strip():
+            continue
+        cells = line.split(",")
+        if len(cells) != len(names):
+            hint = " (decimal commas?)" if len(cells) >= 1.5 * len(names) else ""
+            problem = f"got {len(cells)} cells{hint}, expected {len(names)} as in the header"
+            raise _error(path, problem, number)
+        numbers = np.full(len(cells), np.nan)
+        for k, cell in enumerate(cells):
+            try:
+                numbers[k] = float(cell) if cell.strip() else np.nan
+            except ValueError:
+                problem = f"got {cell.strip()[:40]!r}, expected a number"
+                raise _error(path, problem, number, names[k]) from None
+        values.append(numbers)
+        row.append(number)
     if not values:
         raise _error(path, "got a header and no rows, expected at least 2 rows")
     return Table(names, np.stack(values), np.array(row))
 
 
-def _check_text(path: Path, head: bytes) -> None:
+def _text(path: Path) -> str:
+    """Return the text of a file, or say which other kind of file it is."""
+    data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    head = data[:_HEAD_BYTES]
     if not head.strip():
         raise _error(path, "got an empty file, expected a header and rows")
     # Some loggers write UTF-16 without its mark: every other byte is zero.
@@ -108,8 +106,8 @@ def _check_text(path: Path, head: bytes) -> None:
     if 0 in head:
         raise _error(path, "got a binary file, expected CSV text (or npz, by the end of its name)")
     try:
-        head[: head.rfind(b"\n") + 1].decode("utf-8")
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        got = f"byte 0x{head[error.start]:02x} at {error.start}"
-        line = head.count(b"\n", 0, error.start) + 1
+        line = data.count(b"\n", 0, error.start) + 1
+        got = f"byte 0x{data[error.start]:02x} at {error.start}"
         raise _error(path, f"got {got}, expected UTF-8 text or npz", line) from error

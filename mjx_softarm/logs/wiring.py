@@ -29,9 +29,9 @@ def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
     """Return what a log says against the wiring: "got X, expected Y", empty if it says nothing."""
     # Rows with commands that change from chamber to chamber
     kpa = log.pressure_kpa if log.commanded_kpa is None else log.commanded_kpa
-    if kpa is None or (readings := log.readings_of(spec.sensor)) is None:
+    if kpa is None or log.readings is None:
         return []
-    spring_m = spec.spring_sensor.lengths(readings, np.nan).length_m
+    spring_m = spec.spring_sensor.lengths(log.readings, np.nan).length_m
     known = np.isfinite(spring_m).all(axis=1) & np.isfinite(kpa).all(axis=1)
     kpa, spring_m = kpa[known], spring_m[known]
     n, c = kpa.shape

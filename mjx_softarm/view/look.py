@@ -75,11 +75,10 @@ def looks(log: Log, spec: ArmSpec) -> Callable[[int], Look]:
     """Return a function from the rows of an arm's log to their looks.
 
     Raises:
-        LogError: the log has neither readings of the arm's sensor nor spring lengths.
+        LogError: the log has neither readings nor spring lengths.
     """
     sensor = spec.spring_sensor
-    readings = log.readings_of(sensor)
-    spring_m = log.spring_m if readings is None else sensor.lengths(readings, np.nan).length_m
+    spring_m = log.lengths_m(sensor)
     if spring_m is None:
         problem = f"got neither {sensor.reading_name}0.. nor spring0.., expected springs to draw the arm by"
         raise LogError([Finding(log.source, None, "", problem)])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -43,18 +42,15 @@ def calibrated(demo, tmp_path_factory):
 
 def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
     status, folder = calibrated
-    assert status in (0, 1)
     names = ["arm.toml", "pressures.npz", "report.html", "report.json", "s2r.npz"]
     assert sorted(p.name for p in folder.iterdir()) == names
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
     report = json.loads((folder / "report.json").read_text())
     assert status == (0 if report["trustworthy"] else 1)
-    load_s2r(folder / "s2r.npz", 9)
-
-
-def test_springs_are_the_planted_ones(calibrated):
-    found, planted = (ArmSpec.from_toml(calibrated[1] / "arm.toml"), planted_arm(ArmSpec.default(), seed=0))
-    np.testing.assert_allclose(found.sensor.beta, planted.sensor.beta, rtol=0.005)
+    planted = planted_arm(ArmSpec.default(), seed=0)
+    np.testing.assert_allclose(
+        ArmSpec.from_toml(folder / "arm.toml").sensor.beta, planted.sensor.beta, rtol=0.005
+    )
 
 
 def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated):
@@ -111,45 +107,19 @@ def test_a_known_weight_tells_how_payloads_are_felt(demo, calibrated, tmp_path, 
         assert found.held.factor == 1.0 and status == 1 and why in said.out
 
 
-@pytest.mark.parametrize(("option", "value"), [("--spec", "paper"), ("--s2r", "printed")])
-def test_options_that_a_later_log_does_not_have_are_refused(option, value, tmp_path, capsys):
-    words = ["run", "later.npz", "--since", "before", option, value, "--out", str(tmp_path / "other")]
-    assert main(words) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"error: {option}: got ") and "--since before" in said
-
-
-def test_nothing_is_overwritten(demo, calibrated, capsys):
-    before = (calibrated[1] / "arm.toml").read_bytes()
-    assert main(["run", *demo, "--out", str(calibrated[1])]) == 2
-    assert "which is there already, expected a new folder" in capsys.readouterr().err
-    assert (calibrated[1] / "arm.toml").read_bytes() == before
-
-
-@pytest.fixture
-def trained_env(tmp_path, monkeypatch):
-    """Function from a calibration folder to the environment that a training in `tmp_path / "run"` has."""
-    from train.__main__ import main as train_main
-
-    seen = {}
-    monkeypatch.setattr("train.runs.run.train", lambda run, task, console: seen.update(env=task.job.env))
-    monkeypatch.setattr("train.runs.command._show", lambda *_: None)
-
-    def train(folder):
-        small = ["--env.n-poses", "64", "--out", str(tmp_path / "run")]
-        assert train_main(["reach", "--calibration", str(folder), *small]) == 0
-        return seen["env"]
-
-    return train
-
-
-def test_training_takes_the_folder(calibrated, trained_env, tmp_path):
+def test_training_takes_the_folder(calibrated, tmp_path, monkeypatch):
     """The run has the calibrated arm and its network, and so has what is opened from it."""
+    from train.__main__ import main as train_main
     from train.runs.folder import Run
 
-    env, opened = trained_env(calibrated[1]), Run.open(tmp_path / "run")
-    assert env.spec == opened.spec == ArmSpec.from_toml(calibrated[1] / "arm.toml")
-    network = load_s2r(calibrated[1] / "s2r.npz", 9)
+    tasks, folder = [], calibrated[1]
+    monkeypatch.setattr("train.runs.run.train", lambda run, task, console: tasks.append(task))
+    monkeypatch.setattr("train.runs.command._show", lambda *_: None)
+    small = ["--env.n-poses", "64", "--out", str(tmp_path / "run")]
+    assert train_main(["reach", "--calibration", str(folder), *small]) == 0
+    env, opened = tasks[0].job.env, Run.open(tmp_path / "run")
+    assert env.spec == opened.spec == ArmSpec.from_toml(folder / "arm.toml")
+    network = load_s2r(folder / "s2r.npz", 9)
     for found in (env.s2r, opened.arm.s2r):
         np.testing.assert_array_equal(found.anchors, network.anchors)
     plain = type(env)(env.spec, env.config)
@@ -159,9 +129,7 @@ def test_training_takes_the_folder(calibrated, trained_env, tmp_path):
 
 def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys):
     """Springs alone: the rest of the arm stays as specified, nothing is invented."""
-    springs = tmp_path / "springs.csv"
-    shutil.copy(demo[0], springs)
-    assert main(["run", str(springs), "--out", str(tmp_path / "out")]) == 1
+    assert main(["run", demo[0], "--out", str(tmp_path / "out")]) == 1
     out = capsys.readouterr().out
     assert out.startswith("arm: paper, by default; --spec names another arm\n")
     assert "warning: Chambers: stiffness, area and length are not this arm's" in out
@@ -181,34 +149,25 @@ def test_check_takes_the_arm_s_number_of_chambers(demo, tmp_path, capsys):
     assert main(["check", str(tmp_path / "six.csv"), "--spec", str(tmp_path / "six.toml")]) == 0
 
 
-def test_bad_and_missing_files_and_other_arms_are_refused_in_a_line_and_nothing_is_left(
-    demo, tmp_path, capsys
-):
-    log, _ = read_log(demo[1])
-    short = log.take(np.arange(20))
+def test_what_cannot_be_used_is_refused_in_a_line_and_nothing_is_written(demo, calibrated, tmp_path, capsys):
+    short = read_log(demo[1])[0].take(np.arange(20))
     other, bad = tmp_path / "other.csv", tmp_path / "bad.csv"
     bad.write_bytes(b"time [s];pressure0 [kPa]\n0;1\n1;2\n")
     write_log(other, dataclasses.replace(short, tip_m=3.0 * short.tip_m))
+    before, out = (calibrated[1] / "arm.toml").read_bytes(), tmp_path / "out"
     for arguments, words in (
-        ([str(tmp_path)], str(tmp_path)),
-        ([str(bad)], str(bad)),
-        ([str(tmp_path / "absent.csv")], "absent.csv"),
-        ([demo[1], str(other)], "expected ranges that meet in logs of one arm"),
-        ([demo[1], "--spec", str(tmp_path / "absent.toml")], "absent.toml"),
+        ([tmp_path], str(tmp_path)),
+        ([bad], str(bad)),
+        ([tmp_path / "absent.csv"], "absent.csv"),
+        ([demo[1], other], "expected ranges that meet in logs of one arm"),
+        ([demo[1], "--spec", tmp_path / "absent.toml"], "absent.toml"),
+        ([], "LOG: got nothing"),
+        ([demo[0], "--seed", -1], "--seed: got -1"),
+        ([demo[0], "--since", "before", "--spec", "paper"], "--spec: got paper and --since before"),
+        ([demo[0], "--since", "before", "--s2r", "printed"], "--s2r: got --since before"),
+        ([demo[0], "--out", calibrated[1]], "which is there already, expected a new folder"),
     ):
-        assert main(["run", *arguments, "--out", str(tmp_path / "out")]) == 2
+        assert main(["run", "--out", str(out), *map(str, arguments)]) == 2
         error = capsys.readouterr().err
         assert error.startswith("error: ") and words in error and len(error.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_strict_refuses_a_log_with_a_fault(demo, tmp_path, capsys):
-    log, _ = read_log(demo[0])
-    readings = log.readings.copy()
-    readings[7, 3] = np.nan
-    path = tmp_path / "log.csv"
-    write_log(path, dataclasses.replace(log, readings=readings))
-    assert main(["check", str(path)]) == 1
-    assert "frequency3" in capsys.readouterr().out
-    assert main(["check", "--strict", str(path)]) == 2
-    assert "frequency3" in capsys.readouterr().err
+    assert not out.exists() and (calibrated[1] / "arm.toml").read_bytes() == before

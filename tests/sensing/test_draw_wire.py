@@ -67,12 +67,12 @@ def test_recorded_voltages_calibrate_the_wires(tmp_path):
     log = dataclasses.replace(log, tip_m=None, tip_quaternion=None, marker_m=None)
     write_log(tmp_path / "springs.csv", log)
     assert "voltage0 [V]" in (tmp_path / "springs.csv").read_text().splitlines()[0]
-    log, _ = read_log(tmp_path / "springs.csv")
-    fit = fit_springs(log.readings_of(SPEC.sensor), log.spring_m, SPEC.spring_sensor)
+    log, _ = read_log(tmp_path / "springs.csv", SPEC)
+    fit = fit_springs(log.readings, log.spring_m, SPEC.spring_sensor)
     np.testing.assert_allclose(fit.slope, BETA, rtol=5e-3)
     np.testing.assert_allclose(fit.offset, DELTA_M, atol=1e-3)
-    with pytest.raises(LogError, match="voltage0: got readings of voltage, expected frequency"):
-        log.readings_of(ArmSpec.default().sensor)
+    with pytest.raises(LogError, match="voltage0: got readings of another sensor, expected frequency"):
+        read_log(tmp_path / "springs.csv")
 
 
 def test_policy_is_written_read_and_run(tmp_path):

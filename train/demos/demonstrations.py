@@ -46,7 +46,7 @@ def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Find
     Raises:
         LogError: the file cannot be used; the message has a line for each finding.
     """
-    matrix, extra = read_matrix(path, spec, NEEDED, reading_name=spec.sensor.reading_name)
+    matrix, extra = read_matrix(path, spec, NEEDED)
     refuse(list(_not_finite(matrix)))
     refuse(list(_out_of_range(matrix, spec)))
     refuse(list(_out_of_order(matrix)))

@@ -252,10 +252,7 @@ def _delayed(command_kpa: np.ndarray, before_kpa: np.ndarray, delay: np.ndarray)
 
 def spring_lengths_m(log: Log, spec: ArmSpec) -> np.ndarray | None:
     """Return the spring lengths (n, n_springs) [m] of a log, NaN where a reading is not believed."""
-    readings = log.readings_of(spec.sensor)
-    if readings is None:
-        return log.spring_m
-    return spec.spring_sensor.lengths(readings, np.nan).length_m
+    return log.lengths_m(spec.spring_sensor)
 
 
 def volumes_m3(spring_m: np.ndarray | None, n: int, spec: ArmSpec) -> np.ndarray:

@@ -33,13 +33,6 @@ def arm_log(n=N, seed=0, rate_hz=50.0, **changes):
     return dataclasses.replace(log, **changes)
 
 
-def planted(group, rows, value, columns=slice(None)):
-    """Values of a group with some replaced."""
-    values = np.array(getattr(arm_log(), group))
-    values[rows, ..., columns] = value
-    return {group: values}
-
-
 def simple(rows, header=HEADER):
     return header + "\n" + "".join(f"{row}\n" for row in rows)
 

@@ -9,20 +9,16 @@ from calib.read.logs import read_log, template
 from calib.read.measurements import measure
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import UNITS, log_columns, log_table
-from tests.calib.read.arm_logs import N, arm_log, csv, planted
+from tests.calib.read.arm_logs import N, arm_log, csv
 
 
 @pytest.mark.parametrize("name", ["arm.csv", "arm.npz"])
-@pytest.mark.parametrize("seed", range(3))
-def test_clean_log_comes_back_without_findings(file, name, seed):
-    changes = {"seed": seed, "sequence": np.repeat(np.arange(8.0), N // 8)}
-    log, findings = read_log(file(name, **changes), strict=True)
+def test_clean_log_comes_back_without_findings(file, name):
+    expected = arm_log(sequence=np.repeat(np.arange(8.0), N // 8))
+    log, findings = read_log(file(name, sequence=expected.sequence))
     assert findings == []
-    expected = arm_log(**changes)
     np.testing.assert_array_equal(log.row, expected.row)
-    groups = "time_s readings spring_m tip_m tip_quaternion marker_m payload_kg sequence"
-    for group in groups.split():
-        np.testing.assert_allclose(getattr(log, group), getattr(expected, group), rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(log_table(log)[1], log_table(expected)[1], rtol=1e-8, atol=1e-6)
     assert log.goal is None and log.estimate is None and log.reference_m is None
 
 
@@ -54,7 +50,7 @@ def test_a_row_per_pose_comes_back_without_findings(file, seed):
         "marker_m": None,
         "time_s": 3.0 * np.arange(N),
     }
-    assert read_log(file(**poses), strict=True)[1] == []
+    assert read_log(file(**poses))[1] == []
 
 
 def test_units_and_order_of_the_file_do_not_matter(text):
@@ -73,7 +69,7 @@ def test_units_and_order_of_the_file_do_not_matter(text):
         order = rng.permutation(len(columns))
         headers = [f"{columns[k].name} [{units[k]}]" for k in order]
         content = csv(headers, (inside / factors)[:, order])
-        log, findings = read_log(text(content, f"{trial}.csv"), strict=True)
+        log, findings = read_log(text(content, f"{trial}.csv"))
         assert findings == []
         np.testing.assert_allclose(log_table(log)[1], table, rtol=1e-8, atol=1e-7)
 
@@ -81,9 +77,8 @@ def test_units_and_order_of_the_file_do_not_matter(text):
 def test_template_is_valid_and_its_text_names_all_columns(tmp_path):
     path = tmp_path / "template.csv"
     words = template(path)
-    log, findings = read_log(path, strict=True)
+    log, findings = read_log(path)
     assert findings == [] and len(log) == 10
-    assert not any(line.startswith("#") for line in path.read_text().splitlines())
     groups = {(c.group, c.kind): c.name for c in reversed(log_columns(9, 9, 3))}
     assert all(f"\n{name} " in words for name in groups.values())
     with pytest.raises(FileExistsError, match="template.csv"):
@@ -108,6 +103,7 @@ def test_logs_of_one_arm_and_of_two(spec):
 
 
 def test_too_few_rows_left_are_refused_with_the_reasons(file):
-    path = file(**planted("spring_m", slice(1, None), np.nan, 0))
+    spring_m = arm_log().spring_m
+    spring_m[1:, 0] = np.nan
     with pytest.raises(LogError, match="spring0: 399 x NaN or inf.*\n.*1 rows left, expected 2 at least"):
-        read_log(path)
+        read_log(file(spring_m=spring_m))

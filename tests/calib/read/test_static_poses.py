@@ -3,14 +3,13 @@
 import dataclasses
 
 import numpy as np
-import pytest
+from scipy.spatial.transform import Rotation
 
 from calib.read.static_poses import find_static_poses, nearest_rotation
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.sensing.pose import rotation_from_quaternion
 from tests.linear_arm import CONTROLLER, GOALS, POLICY, SENSOR, LinearArm, between, go, read_m
 
 SPEC = ArmSpec.default()
@@ -117,15 +116,10 @@ def test_logs_with_and_without_markers_or_poses_go_together():
     assert none.n == 0 and none.pressure_kpa.shape == (0, 9) and none.marker_m.shape == (0, 0, 3)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_mean_of_two_rotations_is_halfway(seed):
-    axis = np.random.default_rng(seed).normal(size=3)
-    axis /= np.linalg.norm(axis)
-
-    def turn(angle):
-        return rotation_from_quaternion(np.append(np.cos(angle / 2), np.sin(angle / 2) * axis))
-
-    np.testing.assert_allclose(nearest_rotation(0.5 * (turn(0.1) + turn(0.5))), turn(0.3), atol=1e-12)
+def test_the_mean_of_two_rotations_is_halfway():
+    axis = np.array([0.48, 0.6, 0.64])
+    first, middle, last = (Rotation.from_rotvec(angle * axis).as_matrix() for angle in (0.1, 0.3, 0.5))
+    np.testing.assert_allclose(nearest_rotation(0.5 * (first + last)), middle, atol=1e-12)
 
 
 def test_a_log_of_the_loop_has_a_pose_at_each_arrival():
@@ -146,9 +140,9 @@ def test_a_log_of_the_loop_has_a_pose_at_each_arrival():
 
 def test_a_log_of_a_moving_goal_has_poses_at_its_stops_only():
     """Between the stops the springs are still by the loop's rule, as the goal moves slowly."""
-    slow = np.linspace(GOALS[0], GOALS[1], 3)
-    run = trace(LinearArm(), Controller.of(POLICY, between), slow, pace_s=20.0)
-    assert run.ways and len(run.log) > 1500
+    slow = np.linspace(GOALS[0], 0.75 * GOALS[0] + 0.25 * GOALS[1], 2)
+    run = trace(LinearArm(), Controller.of(POLICY, between), slow, pace_s=10.0)
+    assert run.ways and len(run.log) > 400
     poses, row_uses = find_static_poses([run.log], SPEC)
     assert poses.n == len(run.arrivals) == 2 and sum(row_uses.values()) == len(run.log)
     for k, arrival in enumerate(run.arrivals):
