@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import sys
 import typing
@@ -33,7 +34,6 @@ class Rule:
     high_open: bool = False
     per: str = ""  # parts that may have a number each, such as "chambers"
     length: int | None = None  # length of a field that must be a list; 0: one number for each part
-    why: str = ""  # reason for the lower bound
     unit: str = ""  # unit, and the one that it is confused with, beside the upper bound
 
     @property
@@ -41,7 +41,6 @@ class Rule:
         """The rule in words."""
         noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
-        low += f" ({self.why})" if self.why else ""
         below = "<" if self.high_open else "<="
         high = "" if self.high == math.inf else f"{' and' if low else ''} {below} {self.high:g}"
         high += f" ({self.unit})" if self.unit else ""
@@ -98,39 +97,16 @@ def _expectations(hint: Any) -> Iterator[tuple[Callable[[Any], bool], str]]:
             yield from _expectations(part)
 
 
-def positive(per: str = "", high: float = math.inf, unit: str = "") -> Any:
-    """Declare a number > 0, up to a bound that a wrong unit exceeds."""
-    return field(metadata={"rule": Rule(low=0.0, high=high, low_open=True, per=per, unit=unit)})
+def anything(default: Any = dataclasses.MISSING, **rule: Any) -> Any:
+    """Declare a field with the arguments of its `Rule`: without any, a number."""
+    return field(default=default, metadata={"rule": Rule(**rule)})
 
 
-def not_negative(per: str = "", high: float = math.inf, unit: str = "") -> Any:
-    """Declare a number >= 0, up to a bound that a wrong unit exceeds."""
-    return field(metadata={"rule": Rule(low=0.0, high=high, per=per, unit=unit)})
-
-
-def anything(per: str = "", low: float = -math.inf, high: float = math.inf, unit: str = "") -> Any:
-    """Declare a number in a range, by default any."""
-    return field(metadata={"rule": Rule(low=low, high=high, per=per, unit=unit)})
-
-
-def share(low: float = 0.0, high: float = 1.0) -> Any:
-    """Declare a share in a range, by default 0."""
-    return field(default=0.0, metadata={"rule": Rule(low=low, high=high)})
-
-
-def vector() -> Any:
-    """Declare three numbers, by default zeros."""
-    return field(default=(0.0, 0.0, 0.0), metadata={"rule": Rule(length=3)})
-
-
-def numbers(per: str) -> Any:
-    """Declare a list with one number for each part, such as a section; empty, the default, means zeros."""
-    return field(default=(), metadata={"rule": Rule(per=per, length=0)})
-
-
-def count(default: Any = dataclasses.MISSING, low: int = 1, high: int = MAX_COUNT, why: str = "") -> Any:
-    """Declare a count in a range, with the reason for its lower bound."""
-    return field(default=default, metadata={"rule": Rule(kind=int, low=low, high=high, why=why)})
+positive = functools.partial(anything, low=0.0, low_open=True)
+not_negative = functools.partial(anything, low=0.0)
+count = functools.partial(anything, kind=int, low=1, high=MAX_COUNT)
+vector = functools.partial(anything, (0.0, 0.0, 0.0), length=3)
+numbers = functools.partial(anything, (), length=0)  # one for each part; empty means zeros
 
 
 def scaled(value: PerSection, factor: float) -> PerSection:
