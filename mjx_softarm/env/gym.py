@@ -15,6 +15,7 @@ false: leave such a step out of a replay buffer.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
@@ -61,7 +62,7 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         config: EnvConfig | None = None,
     ):
         self.num_envs = num_envs
-        self.env = _reach_env(arm or ArmSpec.default(), config or EnvConfig())
+        self.env = ReachEnv(arm, config)
         self.single_observation_space, self.single_action_space = spaces(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -120,11 +121,9 @@ class SoftArmEnv(gymnasium.Env):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
     def __init__(self, arm: ArmSpec | None = None, config: EnvConfig | None = None):
-        arm, config = arm or ArmSpec.default(), config or EnvConfig()
-        self.env = _reach_env(arm, config)
+        self.env, self._reset_arm, self._step_arm = _compiled(arm, config)
         self.observation_space, self.action_space = spaces(self.env)
         self._state: State | None = None
-        self._reset_arm, self._step_arm = _compiled(arm, config)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode; a seed fixes all that follows. There are no options."""
@@ -211,14 +210,11 @@ def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
-_reach_env = functools.lru_cache(maxsize=8)(ReachEnv)
-
-
 @functools.lru_cache(maxsize=8)
-def _compiled(arm: ArmSpec, config: EnvConfig) -> tuple:
-    """Return reset and step of one arm, compiled once for all environments that share arm and config."""
-    env = _reach_env(arm, config)
-    return xla.jit(env.reset), xla.jit(env.step)
+def _compiled(arm: ArmSpec | None, config: EnvConfig | None) -> tuple[ReachEnv, Callable, Callable]:
+    """Return an environment, its reset and its step, compiled once for all that share arm and config."""
+    env = ReachEnv(arm, config)
+    return env, xla.jit(env.reset), xla.jit(env.step)
 
 
 def _reset_info(state: State) -> dict[str, Array]:
