@@ -55,8 +55,14 @@ def _picture(
         pressures: [kPa] one for all chambers, or one for each, section by section from the base
         out: PNG file to write
     """
+    # Refuse pressures that the arm cannot have, and an environment that cannot draw.
     arm = ArmSpec.of(spec)
-    _check_pressures(arm, pressures)
+    if len(pressures) not in (1, arm.n_chambers):
+        raise InputError(f"--pressures: got {len(pressures)} numbers, expected 1 or {arm.n_chambers}")
+    low, high = arm.chambers.pressure_min_kpa, arm.chambers.pressure_max_kpa
+    for value in pressures:
+        if not low <= value <= high:
+            raise InputError(f"--pressures: got {value:g}, expected {low:g} to {high:g} kPa")
     _import_mujoco()
     from PIL import Image
 
@@ -174,15 +180,6 @@ def _import_mujoco() -> None:
         raise InputError(
             f"MUJOCO_GL: got {asked!r} ({error}), expected a name with which MuJoCo can be imported"
         ) from error
-
-
-def _check_pressures(spec: ArmSpec, pressures: Sequence[float]) -> None:
-    if len(pressures) not in (1, spec.n_chambers):
-        raise InputError(f"--pressures: got {len(pressures)} numbers, expected 1 or {spec.n_chambers}")
-    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    for value in pressures:
-        if not low <= value <= high:
-            raise InputError(f"--pressures: got {value:g}, expected {low:g} to {high:g} kPa")
 
 
 if __name__ == "__main__":
