@@ -10,7 +10,7 @@ import pytest
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
-from mjx_softarm.env.state import EpisodeMotion
+from mjx_softarm.env.state import motion_params
 from mjx_softarm.mechanics.params import ArmParams
 
 MM = 1e-3
@@ -102,11 +102,10 @@ def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spri
 
 def test_numbers_of_regulators_fill_their_bounds(spec):
     numbers = {"lag_s": 0.5, "dead_time_s": 0.2, "fill_kpa_per_s": 50.0, "vent_kpa_per_s": 20.0}
-    spec = spec.replace(actuators={"kind": "regulator", "deadband_kpa": 0.2, **numbers})
-    spread = Randomisation(regulator_spread=0.1)
-    episode = EpisodeMotion(spec, EnvConfig(mode="dynamic", randomisation=spread))
+    actuators = spec.replace(actuators={"kind": "regulator", "deadband_kpa": 0.2, **numbers}).actuators
     for share, factor in ((None, 1.0), (0.0, 0.9), (1.0, 1.1)):
-        own = episode.params(share if share is None else jnp.full(6, share))
+        given = share if share is None else jnp.full(6, share)
+        own = motion_params(actuators, Randomisation(regulator_spread=0.1), given)
         drawn = {name: getattr(own.actuators, name) for name in numbers} | {"dead_time_s": own.delay_s}
         for name, value in numbers.items():
             np.testing.assert_allclose(drawn[name], factor * value, rtol=1e-6)
