@@ -21,7 +21,7 @@ from mjx_softarm import control
 from mjx_softarm._support import draws
 from mjx_softarm._support.lazy import brax_envs, put
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeNoise, State, motion_params, nominal_share
+from mjx_softarm.env.state import ArmState, State, motion_params, nominal_share
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
@@ -39,6 +39,7 @@ from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.spec import ArmSpec
 
+PAYLOAD_SHARE = 2  # index of the payload in the numbers of `ReachEnv.sample_noise`
 POOL_SEED = 0  # of the poses that starts and goals are drawn from; not that of held-out ones
 CLEARANCE_MARGIN_MM = 10.0  # clearance of the body to the wall from which there is no cost
 
@@ -52,7 +53,6 @@ class PosePool:
 
     def __init__(self, spec: ArmSpec, config: EnvConfig, observed: Callable[[Array, Array], Array]):
         self._spec, self._config, self._observed = spec, config, observed
-        self._settled = functools.cache(lambda: self.draw(POOL_SEED))
         self._given = ContextVar[Pool | None]("pool", default=None)
         sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
         shapes: Any = (jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes)
@@ -60,10 +60,12 @@ class PosePool:
 
     def __call__(self) -> Pool:
         """Return the poses."""
-        if (given := self._given.get()) is not None:
-            return given
+        return self._given.get() or self._settled
+
+    @functools.cached_property
+    def _settled(self) -> Pool:
         with ThreadPoolExecutor(1) as elsewhere:  # the first use may be in a function that is traced
-            return elsewhere.submit(self._settled).result()
+            return elsewhere.submit(self.draw, POOL_SEED).result()
 
     @contextlib.contextmanager
     def given(self, pool: Pool) -> Iterator[None]:
@@ -173,8 +175,7 @@ class ReachEnv(brax_envs.Env):
 
     @property
     def backend(self) -> str:
-        """Simulation that runs: the engine, at rest or in motion."""
-        return f"{self.config.engine} dynamic" if self.config.in_motion else self.config.engine
+        return self.config.engine
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
         """Return the pose, corrected if there is a sim-to-real network."""
@@ -193,30 +194,32 @@ class ReachEnv(brax_envs.Env):
 
     def reset(self, rng: Array) -> State:
         """Start an episode: an arm of the randomisation, at a random pose, with a random goal."""
-        return self.reset_from(jax.tree.map(lambda x: x[0], self.sample_noise(rng, 1)))
+        return self.reset_from(self.sample_noise(rng, 1)[0])
 
-    def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
-        """Draw the random numbers of n episodes: leaves (n, ...)."""
-        uniform = draws.uniform(rng, (n, 3 + self.spec.n_chambers))
-        if not self.config.in_motion:
-            return EpisodeNoise(uniform, None)
-        shape = n, len(nominal_share(self.actuators))
-        return EpisodeNoise(uniform, draws.uniform(jax.random.fold_in(rng, 1), shape))
+    def sample_noise(self, rng: Array, n: int) -> Array:
+        """Draw the numbers from 0 to 1 that fix n episodes, a row each.
 
-    def reset_from(self, noise: EpisodeNoise) -> State:
-        """Start the episode that `noise` fixes."""
+        They are start, goal, payload, the stiffness of each chamber, and `share` of `motion_params`.
+        """
+        moving = jnp.tile(nominal_share(self.actuators), (n, 1))
+        if self.config.in_motion:
+            moving = draws.uniform(jax.random.fold_in(rng, 1), moving.shape)
+        return jnp.concatenate([draws.uniform(rng, (n, 3 + self.spec.n_chambers)), moving], axis=1)
+
+    def reset_from(self, share: Array) -> State:
+        """Start the episode that a row of `sample_noise` fixes."""
         # Start and goal, and the arm of this episode
-        share = noise.uniform
         start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
         pool = self.pool
         start = jax.tree.map(lambda x: x[start_row], pool)
         goal = pool.pose[goal_row]
         spread = self.config.randomisation
-        factor = 1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)
+        stiffness, moving = jnp.split(share[3:], [self.spec.n_chambers])
+        factor = 1.0 + spread.stiffness_spread * (2.0 * stiffness - 1.0)
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],
             chamber_stiffness=self.params.stiffened(factor).chamber_stiffness,
-            moving=motion_params(self.actuators, spread, noise.moving),
+            moving=motion_params(self.actuators, spread, moving),
             motion=self._resting(start),
             pose=start.pose,
             spring_m=start.spring_m,

@@ -1,4 +1,4 @@
-"""State of one arm of the environment, and the random numbers of its episode."""
+"""State of one arm of the environment, and the parameters of its motion in an episode."""
 
 from __future__ import annotations
 
@@ -18,16 +18,6 @@ from mjx_softarm.sensing.sensors import SENSORS
 
 for _sensor in SENSORS.values():
     jax.tree_util.register_dataclass(_sensor)  # its numbers are traced
-
-
-PAYLOAD_SHARE = 2  # index in `EpisodeNoise.uniform`
-
-
-class EpisodeNoise(NamedTuple):
-    """Random numbers that fix one episode."""
-
-    uniform: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
-    moving: Array | None  # (k,) `share` of `motion_params`; None for arms at rest
 
 
 class ArmState(NamedTuple):
@@ -57,21 +47,21 @@ class State(brax_envs.State):
         def replace(self, **fields: Any) -> State: ...
 
 
-def nominal_share(actuators: Actuators) -> list[float]:
+def nominal_share(actuators: Actuators) -> Array:
     """Return the `share` of `motion_params` that gives the nominal parameters."""
-    return [0.5, 0.0, 0.0, *([0.5] * 3 if isinstance(actuators, Regulator) else [])]
+    return jnp.array([0.5, 0.0, 0.0] + [0.5] * 3 * isinstance(actuators, Regulator))
 
 
-def motion_params(actuators: Actuators, spread: Randomisation, share: Array | None) -> MotionParams:
+def motion_params(actuators: Actuators, spread: Randomisation, share: Array) -> MotionParams:
     """Return the parameters of an arm's motion in an episode.
 
     Args:
         actuators: the nominal ones.
         spread: differences between episodes.
         share (k,): random numbers from 0 to 1: damping, delay and friction, then lag, dead time and rates of
-            regulators. None gives the nominal parameters.
+            regulators.
     """
-    damping, delay, friction, *others = jnp.array(nominal_share(actuators)) if share is None else share
+    damping, delay, friction, *others = share
     delay_s = actuators.delay_s
     if isinstance(actuators, Regulator):
         lag, dead_time, rate = (1.0 + spread.regulator_spread * (2.0 * x - 1.0) for x in others)
