@@ -313,7 +313,7 @@ class ArmSpec:
         Raises:
             SpecError: a field is missing, unknown, of the wrong type or out of range.
         """
-        spec = cls(**read_fields(cls, data, source, ""))
+        spec = cls(**read_fields(cls, data, f"{source}: "))
         spec._check_together(source)
         return spec
 
@@ -363,7 +363,7 @@ class ArmSpec:
             "chambers": self.n_chambers,
             "springs": self.n_springs,
         }
-        check_counts(self, counts, source, "")
+        check_counts(self, counts, f"{source}: ")
 
         # A negative bond leaves the backbone some stiffness
         backbone = self.backbone.axial_stiffness_n_per_m, self.backbone.bending_stiffness_nm_per_rad
