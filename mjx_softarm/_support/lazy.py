@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-__all__ = ["LazyModule", "brax_envs", "mjx", "mujoco", "put"]
-
 
 class LazyModule:
     """Stand-in for a module: the first attribute that is asked for imports it."""

@@ -112,10 +112,9 @@ def rows_last(function: Callable, n_at_once: int | None = None) -> Callable:
     return one
 
 
-def enable_compilation_cache() -> Path:
+def enable_compilation_cache() -> None:
     """Keep compiled programs in `$XDG_CACHE_HOME/mjx_softarm/xla` or `~/.cache`, for a fast second start."""
     path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx_softarm" / "xla"
     path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    return path
