@@ -189,7 +189,7 @@ class Entries:
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    same = (n == m or (m is None and n > 0) for n, m in zip(shape, expected, strict=False))
+    same = (n > 0 if m is None else n == m for n, m in zip(shape, expected, strict=False))
     return len(shape) == len(expected) and all(same)
 
 

@@ -75,15 +75,10 @@ class EnvConfig:
 
     @property
     def in_motion(self) -> bool:
-        """Whether the arm is in motion."""
         return self.mode == "dynamic"
 
     def arm(self, spec: ArmSpec, corrected: bool = False) -> ArmSpec:
-        """Return the arm as it is simulated.
-
-        Args:
-            spec: the arm.
-            corrected: whether it has a sim-to-real network, which holds for its own links alone.
+        """Return the arm as it is simulated; a sim-to-real network (`corrected`) holds for its own links.
 
         Raises:
             InputError: a corrected arm is to have other links, an action is shorter than a control period, or

@@ -54,8 +54,8 @@ def play(*script):
     start = state = arms.reset(jax.random.key(0))
     history = []
     for index, row in enumerate(script):
-        state, *others = step(state, jnp.array(row)[:, None], jax.random.key(index + 1))
-        history.append((state, *others))
+        history.append(step(state, jnp.array(row)[:, None], jax.random.key(index + 1)))
+        state = history[-1][0]
     return start, history
 
 
@@ -89,7 +89,7 @@ def test_an_episode_ends_in_one_way_and_the_next_one_begins(script, terminated, 
     assert after.reward[0] == 10.0 * script[-1]
     assert state.metrics["unsettled"][0] == (not valid)  # counted, though the arm is a new one
     for _, before, *ends in history[:-1]:
-        assert not ends[0][0] and not ends[1][0] and before.info["valid"][0]
+        assert not np.array(ends)[:, 0].any() and before.info["valid"][0]
     assert [bool(end[1]) for end in history[-1][2:]] == [False, len(script) == EPISODE_LENGTH]
 
 
