@@ -72,8 +72,7 @@ def _picture(
     from mjx_softarm.mechanics.workspace import settle_many
 
     # Settle the arm, then draw it as it stands.
-    pressure_kpa = np.broadcast_to(np.asarray(pressures), (1, arm.n_chambers))
-    settled = settle_many(arm, pressure_kpa)
+    settled = settle_many(arm, np.broadcast_to(pressures, (1, arm.n_chambers)))
     if not settled.settled[0]:
         where, check = "--pressures", ""
         if not any(pressures):
@@ -133,9 +132,8 @@ def _tell_lengths(spec: ArmSpec, spring_m: np.ndarray) -> None:
     """Print the lengths that springs (n, n_springs) [m] reach, and say where their limits are far from it."""
     low_m, high_m = spec.springs.length_min_m, spec.springs.length_max_m
     n = spec.structure.n_sections if isinstance(low_m, tuple) or isinstance(high_m, tuple) else 1
-    parts = np.split(spring_m, n, axis=1)
-    for k in range(n):
-        shortest, longest = parts[k].min(), parts[k].max()
+    for k, part in enumerate(np.split(spring_m, n, axis=1)):
+        shortest, longest = part.min(), part.max()
         low, high = spec.per_section(low_m)[k], spec.per_section(high_m)[k]
         far = max(abs(low - shortest), abs(high - longest)) > FAR_LIMIT * (longest - shortest)
         print(
