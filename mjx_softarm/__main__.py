@@ -55,8 +55,14 @@ def _picture(
         pressures: [kPa] one for all chambers, or one for each, section by section from the base
         out: PNG file to write
     """
+    # Refuse pressures that the arm cannot have, and an environment that cannot draw.
     arm = ArmSpec.of(spec)
-    _check_pressures(arm, pressures)
+    if len(pressures) not in (1, arm.n_chambers):
+        raise InputError(f"--pressures: got {len(pressures)} numbers, expected 1 or {arm.n_chambers}")
+    low, high = arm.chambers.pressure_min_kpa, arm.chambers.pressure_max_kpa
+    for value in pressures:
+        if not low <= value <= high:
+            raise InputError(f"--pressures: got {value:g}, expected {low:g} to {high:g} kPa")
     _import_mujoco()
     from PIL import Image
 
@@ -66,8 +72,7 @@ def _picture(
     from mjx_softarm.mechanics.workspace import settle_many
 
     # Settle the arm, then draw it as it stands.
-    pressure_kpa = np.broadcast_to(np.asarray(pressures), (1, arm.n_chambers))
-    settled = settle_many(arm, pressure_kpa)
+    settled = settle_many(arm, np.broadcast_to(pressures, (1, arm.n_chambers)))
     if not settled.settled[0]:
         where, check = "--pressures", ""
         if not any(pressures):
@@ -127,9 +132,8 @@ def _tell_lengths(spec: ArmSpec, spring_m: np.ndarray) -> None:
     """Print the lengths that springs (n, n_springs) [m] reach, and say where their limits are far from it."""
     low_m, high_m = spec.springs.length_min_m, spec.springs.length_max_m
     n = spec.structure.n_sections if isinstance(low_m, tuple) or isinstance(high_m, tuple) else 1
-    parts = np.split(spring_m, n, axis=1)
-    for k in range(n):
-        shortest, longest = parts[k].min(), parts[k].max()
+    for k, part in enumerate(np.split(spring_m, n, axis=1)):
+        shortest, longest = part.min(), part.max()
         low, high = spec.per_section(low_m)[k], spec.per_section(high_m)[k]
         far = max(abs(low - shortest), abs(high - longest)) > FAR_LIMIT * (longest - shortest)
         print(
@@ -174,15 +178,6 @@ def _import_mujoco() -> None:
         raise InputError(
             f"MUJOCO_GL: got {asked!r} ({error}), expected a name with which MuJoCo can be imported"
         ) from error
-
-
-def _check_pressures(spec: ArmSpec, pressures: Sequence[float]) -> None:
-    if len(pressures) not in (1, spec.n_chambers):
-        raise InputError(f"--pressures: got {len(pressures)} numbers, expected 1 or {spec.n_chambers}")
-    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    for value in pressures:
-        if not low <= value <= high:
-            raise InputError(f"--pressures: got {value:g}, expected {low:g} to {high:g} kPa")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ from mjx_softarm._support.fields import (
     numbers,
     positive,
     read_fields,
-    share,
     vector,
 )
 from mjx_softarm.arms import shipped_arm
@@ -37,7 +36,7 @@ ARM_FILE = "arm.toml"  # in the folder of a calibration
 # Of the paper's arm, simulated on the circle in 20 s.
 SHAPE_SHARE = 0.65
 MOST_RATIO = 3.0  # of a spring's length and that of its section, either way; larger ratios are input errors
-LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
+LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section; fewer bend it in one plane
 BONDS = -0.3, 2.0  # of rods, whose springs are bonded, too, calibrations find up to 1.3
 # Upper bounds that no soft arm exceeds, but its number in another unit does.
 LENGTH = {"high": 2.0, "unit": "m, not mm"}
@@ -53,8 +52,8 @@ class Structure:
 
     n_sections: int = count()
     links_per_section: int = count()
-    chambers_per_section: int = count(3, LEAST_CHAMBERS, MOST_CHAMBERS, "fewer bend a section in one plane")
-    springs_per_section: int = count(default=0, low=0, high=MOST_CHAMBERS)  # 0: one beside each chamber
+    chambers_per_section: int = count(3, low=LEAST_CHAMBERS, high=MOST_CHAMBERS)
+    springs_per_section: int = count(0, low=0, high=MOST_CHAMBERS)  # 0: one beside each chamber
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ class Chambers:
     length_offset_m: PerChamber = anything(per="chambers", low=-0.1, high=0.1)
     pressure_min_kpa: float = anything(low=-101.325, **PRESSURE)
     pressure_max_kpa: float = anything(low=-101.325, **PRESSURE)
-    bonded_share: float = share(*BONDS)
+    bonded_share: float = anything(0.0, low=BONDS[0], high=BONDS[1])
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ class Mounting:
 
     base_turn_deg: tuple[float, ...] = vector()  # turn of the base, in the base frame
     base_offset_m: tuple[float, ...] = vector()  # offset of the base, in the base frame
-    section_roll_deg: tuple[float, ...] = numbers("sections")  # roll of each section's holes about its axis
+    section_roll_deg: tuple[float, ...] = numbers(per="sections")  # roll of a section's holes about its axis
     tip_turn_deg: tuple[float, ...] = vector()  # turn of the measured tip, in the axes of the last plate
     tip_offset_m: tuple[float, ...] = vector()  # offset of the measured tip, in the axes of the last plate
 
@@ -162,7 +161,7 @@ class Unmodelled:
     The simulation ignores them; the estimate of a payload from pressures subtracts them.
     """
 
-    pressure_kpa: tuple[float, ...] = numbers("chambers")
+    pressure_kpa: tuple[float, ...] = numbers(per="chambers")
 
 
 @dataclass(frozen=True)
@@ -314,7 +313,7 @@ class ArmSpec:
         Raises:
             SpecError: a field is missing, unknown, of the wrong type or out of range.
         """
-        spec = cls(**read_fields(cls, data, source, ""))
+        spec = cls(**read_fields(cls, data, f"{source}: "))
         spec._check_together(source)
         return spec
 
@@ -364,7 +363,7 @@ class ArmSpec:
             "chambers": self.n_chambers,
             "springs": self.n_springs,
         }
-        check_counts(self, counts, source, "")
+        check_counts(self, counts, f"{source}: ")
 
         # A negative bond leaves the backbone some stiffness
         backbone = self.backbone.axial_stiffness_n_per_m, self.backbone.bending_stiffness_nm_per_rad

@@ -6,6 +6,11 @@ _PAPER = ArmSpec.default()
 SHORT = _PAPER.replace(structure={"n_sections": 1, "links_per_section": 2})  # compiles in seconds
 
 
+def with_arm(state, **changes):
+    """The environment's state with parts of its arms exchanged."""
+    return state.replace(pipeline_state=state.pipeline_state._replace(**changes))
+
+
 def _chambers(share):
     """The paper's chambers with a share of its area and stiffness, so that a section moves as the paper's."""
     names = "area_m2", "area_slope_m", "stiffness_n_per_m", "damping_ns_per_m"

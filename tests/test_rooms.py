@@ -34,17 +34,15 @@ HEAVY = {"jax", "jaxlib", "mujoco"}
 LIGHT = ("export", "deploy", "policy", "sensing", "mdp", "logs", "view")
 
 
-def imported(tree, path):
-    """Every name that a part of a file imports anywhere in it: modules, and what is taken from them."""
-    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
+def imported(tree):
+    """Every name that a file imports anywhere in it: modules, and what is taken from them."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else ()
-            module = ".".join([*base, *([node.module] if node.module else [])])
-            yield module
-            yield from (f"{module}.{alias.name}" for alias in node.names)
+            assert not node.level, f"{ast.unparse(node)}: expected the name of the room"
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def room_of(name):
@@ -55,45 +53,33 @@ def room_of(name):
     return top if top in JOBS else None
 
 
-def files():
-    """(room, path) of every file of the product and of the benchmarks."""
-    for top in ("mjx_softarm", *JOBS):
-        for path in sorted((ROOT / top).rglob("*.py")):
-            yield room_of(".".join(path.relative_to(ROOT).with_suffix("").parts)), path
+def module_of(path):
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
 
 
-TREES = [(room, path, ast.parse(path.read_text("utf-8"))) for room, path in files()]
+# Room, path and syntax tree of every file of the product and of the benchmarks
+FILES = [path for top in ("mjx_softarm", *JOBS) for path in sorted((ROOT / top).rglob("*.py"))]
+TREES = [(room_of(module_of(path)), path, ast.parse(path.read_text("utf-8"))) for path in FILES]
 ARROWS = [
-    (room, other, path)
-    for room, path, tree in TREES
-    for name in imported(tree, path)
-    if (other := room_of(name))
+    (room, other, path) for room, path, tree in TREES for name in imported(tree) if (other := room_of(name))
 ]
 
 
 def test_every_file_stands_in_a_room():
-    assert not [path for room, path in files() if room is None]
+    assert not [path for room, path, _ in TREES if room is None]
     assert len(ARROWS) > 300
 
 
 def test_imports_run_one_way():
-    backward = {
-        (str(path.relative_to(ROOT)), other) for room, other, path in ARROWS if LEVEL[other] > LEVEL[room]
-    }
-    assert not backward
-
-
-def test_no_circle_between_rooms():
+    assert not {(path, other) for room, other, path in ARROWS if LEVEL[other] > LEVEL[room]}
+    # Rooms of one level make no circle
     graph = {room: {b for a, b, _ in ARROWS if a == room and b != room} for room in LEVEL}
     assert set(graphlib.TopologicalSorter(graph).static_order()) >= set(LEVEL)
 
 
 def test_no_circle_between_files():
     """Imports in functions and imports for types count, too."""
-    taken = {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): imported(tree, path)
-        for _, path, tree in TREES
-    }
+    taken = {module_of(path).removesuffix(".__init__"): imported(tree) for _, path, tree in TREES}
     graph = {name: (set(found) & taken.keys()) - {name} for name, found in taken.items()}
     assert sum(map(len, graph.values())) > 200
     assert len(list(graphlib.TopologicalSorter(graph).static_order())) == len(graph)
@@ -106,13 +92,13 @@ def test_nothing_imports_the_view():
 @pytest.mark.parametrize("room", ["train", "calib"])
 def test_training_and_calibration_never_import_the_twin(room):
     assert "twin" not in {other for top, other, _ in ARROWS if top == room}
-    texts = {path: path.read_text("utf-8") for top, path in files() if top == room}
-    assert not [path for path, text in texts.items() if "softarm.twin" in text]  # importlib, by a string
+    # Nor is it imported by a string
+    assert not [path for top, path, _ in TREES if top == room and "softarm.twin" in path.read_text("utf-8")]
 
 
 @pytest.mark.parametrize("room", LIGHT)
 def test_light_rooms_name_no_simulator(room):
-    names = {(path, name) for top, path, tree in TREES if top == room for name in imported(tree, path)}
+    names = {(path, name) for top, path, tree in TREES if top == room for name in imported(tree)}
     assert names and not {(path, name) for path, name in names if name.split(".")[0] in HEAVY}
 
 

@@ -25,7 +25,8 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
-from mjx_softarm.env.state import PAYLOAD_SHARE, State
+from mjx_softarm.env.reach import PAYLOAD_SHARE
+from mjx_softarm.env.state import State
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
@@ -137,9 +138,8 @@ def goals_of(env: ReachEnv, n_goals: int) -> list[Array]:
 
 def follow(env: ReachEnv, learner: Any, policy: Any, load_kg: Array, path: Array, key: Array) -> Reached:
     """Return the results of one arm with a payload, from a random start, along a path (n, 6) of goals."""
-    noise = jax.tree.map(lambda x: x[0], env.sample_noise(key, 1))
-    share = noise.uniform.at[PAYLOAD_SHARE].set(load_kg / env.payload_max_kg)
-    return evaluate.follow(env, learner, policy, path, env.reset_from(noise._replace(uniform=share)))
+    noise = env.sample_noise(key, 1)[0].at[PAYLOAD_SHARE].set(load_kg / env.payload_max_kg)
+    return evaluate.follow(env, learner, policy, path, env.reset_from(noise))
 
 
 def figures(off_mm: np.ndarray, n_saturated: np.ndarray) -> dict[str, float]:

@@ -104,7 +104,7 @@ def rollout(engine: Any, mode: Any, n: int, mesh: Mesh) -> Program:
         def step(state: Any, key: jax.Array) -> Any:
             key_action, key_reset = jax.random.split(key)
             action = draws.uniform(key_action, (arms.n, env.action_size), minval=-1.0)
-            following, after, _ = arms.step(state, action, key_reset)
+            following, after, *_ = arms.step(state, action, key_reset)
             ends = env.reference_m(action), after.pipeline_state.pose[:, :3]
             return following, (after.metrics["unsettled"], after.metrics["saturated_chambers"], *ends)
 

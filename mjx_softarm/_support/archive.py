@@ -35,11 +35,7 @@ class SealedFileError(InputError):
 
 
 def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
-    """Write arrays by name, whole or not at all; the same arrays give the same bytes.
-
-    Raises:
-        SealedFileError: the file cannot be written.
-    """
+    """Write arrays by name, whole or not at all; equal arrays give equal bytes. Raises SealedFileError."""
     try:
         with replacing(path) as part:
             part.write_bytes(sealed(arrays, kind))
@@ -48,7 +44,7 @@ def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
 
 
 def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
-    """Read the arrays of a file of `write_sealed`; `made_by` is the command that makes such files.
+    """Read the arrays of a file that the command `made_by` writes.
 
     Raises:
         SealedFileError: the file cannot be read, is incomplete, damaged or of another kind.
@@ -121,10 +117,7 @@ class Entries:
         raise SealedFileError(f"{self._source}: {name}: {problem}")
 
     def take(self, name: str, kind: type, *shapes: tuple[int | None, ...]) -> Any:
-        """Return a finite array of `kind` in one of the `shapes`; a single value as Python's own type.
-
-        A dimension of None stands for any size from 1.
-        """
+        """Return a finite array in one of the `shapes`, None for any size from 1; a scalar as Python's."""
         if name not in self._arrays:
             self.fail(name, "got nothing, expected an entry")
         array = self._arrays[name]
@@ -178,7 +171,7 @@ class Entries:
     ) -> Any:
         """Return a named tuple of float32 arrays and, with numbers of inputs and outputs, of `layers`.
 
-        Numbers of a field with `_scale` in its name must be > 0.
+        Fields with `_scale` in their names must be > 0.
         """
         values: dict[str, Any] = {}
         for item, shape in shapes.items():
@@ -191,12 +184,12 @@ class Entries:
 
     def finish(self, schema: int) -> None:
         """Refuse entries that nobody took."""
-        for name in sorted(self._left):
-            self.fail(name, f"got an unknown entry, expected those of schema {schema}")
+        if self._left:
+            self.fail(min(self._left), f"got an unknown entry, expected those of schema {schema}")
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    same = (n == m or (m is None and n > 0) for n, m in zip(shape, expected, strict=False))
+    same = (n > 0 if m is None else n == m for n, m in zip(shape, expected, strict=False))
     return len(shape) == len(expected) and all(same)
 
 

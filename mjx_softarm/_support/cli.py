@@ -1,7 +1,6 @@
 """Command lines: tyro reads the options of a command; an error is printed on stderr, with exit status 2.
 
-A command is a function, or a dataclass that is called once its options are read. Type annotations say which
-values an option may have, docstrings say what it means.
+A command is a function, or a dataclass that is called once its options are read.
 """
 
 from __future__ import annotations
@@ -70,10 +69,9 @@ def main(
 
 
 def guarded(run: Callable[[], int]) -> int:
-    """Run a command and return its exit status.
+    """Run a command; return its exit status: 2 after an error that the user can put right, 130 after Ctrl-C.
 
-    It is 2 after an error that the user can put right, 130 after Ctrl-C, and 141 where the reader of the
-    output has ended, as `head` does. Such a command ends quietly.
+    It is 141 where the reader of the output has ended, as `head` does. Such a command ends quietly.
     """
     try:
         status = _status(run)
@@ -87,7 +85,7 @@ def guarded(run: Callable[[], int]) -> int:
 
 
 def _status(run: Callable[[], int]) -> int:
-    """Return a command's exit status; errors that its user can put right are printed on stderr."""
+    """Return a command's exit status; print errors that its user can put right."""
     try:
         return run()
     except SystemExit as stop:
@@ -97,7 +95,7 @@ def _status(run: Callable[[], int]) -> int:
     except InputError as error:
         text = str(error)
     except OSError as error:
-        if isinstance(error, BrokenPipeError) and _is_unread():
+        if isinstance(error, BrokenPipeError) and _is_unread():  # else it is of an arm's connection
             raise
         why = f"{error.filename}: got {error.strerror!r}, expected a file or folder that can be used"
         text = why if error.filename else str(error)
@@ -122,9 +120,8 @@ def _line(command: Command) -> str:
     """Return the first line of a command's docstring."""
     if isinstance(command, str):  # read from the file, because an import may take seconds
         module, _, name = command.partition(":")
-        module_spec = importlib.util.find_spec(module)
-        assert module_spec and module_spec.origin, module
-        body = ast.parse(Path(module_spec.origin).read_text("utf-8")).body
+        found: Any = importlib.util.find_spec(module)
+        body = ast.parse(found.loader.get_source(module)).body
         defined = [node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
         text = next(ast.get_docstring(node) for node in defined if node.name == name)
     else:

@@ -25,8 +25,8 @@ def normal(key: Array, shape: tuple[int, ...]) -> Array:
 def integers(key: Array, n: int, below: Array) -> Array:
     """Return integers (n,) from 0 to below `below` (), uint32.
 
-    They are remainders of random bits, which compile faster than `jax.random.randint`. Some integers are
-    more likely than others, by less than one in a thousand for `below` up to four million.
+    They are remainders of random bits, which compile faster than `jax.random.randint`. Some are more likely
+    than others, by less than one in a thousand for `below` up to four million.
     """
     return jax.random.bits(key, (n,), jnp.uint32) % below.astype(jnp.uint32)
 

@@ -14,10 +14,7 @@ class InputError(ValueError):
 
 
 def check_settings(where: str, settings: Any, required: Mapping[str, tuple[Any, str]]) -> None:
-    """Raise InputError for the first setting in `required` (name -> holds, expected) that does not hold.
-
-    The message begins with `where`, the path or class of the settings.
-    """
+    """Raise InputError for the first setting in `required` (name -> holds, expected) that does not hold."""
     for name, (holds, expected) in required.items():
         if not holds:
             raise InputError(f"{where}.{name}: got {getattr(settings, name)!r}, expected {expected}")
@@ -25,11 +22,7 @@ def check_settings(where: str, settings: Any, required: Mapping[str, tuple[Any, 
 
 @contextlib.contextmanager
 def needing(extra: str, where: str) -> Iterator[None]:
-    """Import packages of an optional extra of this project, such as `onnx`, within this context.
-
-    Raises:
-        InputError: a package is missing; the message begins with `where`.
-    """
+    """Import packages of an optional extra, which `where` needs, within this context. Raises InputError."""
     try:
         yield
     except ImportError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import sys
 import typing
@@ -33,7 +34,6 @@ class Rule:
     high_open: bool = False
     per: str = ""  # parts that may have a number each, such as "chambers"
     length: int | None = None  # length of a field that must be a list; 0: one number for each part
-    why: str = ""  # reason for the lower bound
     unit: str = ""  # unit, and the one that it is confused with, beside the upper bound
 
     @property
@@ -41,7 +41,6 @@ class Rule:
         """The rule in words."""
         noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
-        low += f" ({self.why})" if self.why else ""
         below = "<" if self.high_open else "<="
         high = "" if self.high == math.inf else f"{' and' if low else ''} {below} {self.high:g}"
         high += f" ({self.unit})" if self.unit else ""
@@ -74,7 +73,7 @@ PositiveShare = Annotated[float, Rule(low=0.0, high=1.0, low_open=True)]
 def check_ranges(where: str, settings: Any) -> None:
     """Raise InputError for a setting outside the range, or the names, of its type; None has no range.
 
-    The message begins with `where`, the path or class of the settings with a dot at its end, or empty.
+    `where` is the path or class of the settings with a dot at its end, or empty.
     """
     hints = typing.get_type_hints(type(settings), include_extras=True)
     for item in fields(settings):
@@ -98,39 +97,16 @@ def _expectations(hint: Any) -> Iterator[tuple[Callable[[Any], bool], str]]:
             yield from _expectations(part)
 
 
-def positive(per: str = "", high: float = math.inf, unit: str = "") -> Any:
-    """Declare a number > 0, up to a bound that a wrong unit exceeds."""
-    return field(metadata={"rule": Rule(low=0.0, high=high, low_open=True, per=per, unit=unit)})
+def anything(default: Any = dataclasses.MISSING, **rule: Any) -> Any:
+    """Declare a field with the arguments of its `Rule`: without any, a number."""
+    return field(default=default, metadata={"rule": Rule(**rule)})
 
 
-def not_negative(per: str = "", high: float = math.inf, unit: str = "") -> Any:
-    """Declare a number >= 0, up to a bound that a wrong unit exceeds."""
-    return field(metadata={"rule": Rule(low=0.0, high=high, per=per, unit=unit)})
-
-
-def anything(per: str = "", low: float = -math.inf, high: float = math.inf, unit: str = "") -> Any:
-    """Declare a number in a range, by default any."""
-    return field(metadata={"rule": Rule(low=low, high=high, per=per, unit=unit)})
-
-
-def share(low: float = 0.0, high: float = 1.0) -> Any:
-    """Declare a share in a range, by default 0."""
-    return field(default=0.0, metadata={"rule": Rule(low=low, high=high)})
-
-
-def vector() -> Any:
-    """Declare three numbers, by default zeros."""
-    return field(default=(0.0, 0.0, 0.0), metadata={"rule": Rule(length=3)})
-
-
-def numbers(per: str) -> Any:
-    """Declare a list with one number for each part, such as a section; empty, the default, means zeros."""
-    return field(default=(), metadata={"rule": Rule(per=per, length=0)})
-
-
-def count(default: Any = dataclasses.MISSING, low: int = 1, high: int = MAX_COUNT, why: str = "") -> Any:
-    """Declare a count in a range, with the reason for its lower bound."""
-    return field(default=default, metadata={"rule": Rule(kind=int, low=low, high=high, why=why)})
+positive = functools.partial(anything, low=0.0, low_open=True)
+not_negative = functools.partial(anything, low=0.0)
+count = functools.partial(anything, kind=int, low=1, high=MAX_COUNT)
+vector = functools.partial(anything, (0.0, 0.0, 0.0), length=3)
+numbers = functools.partial(anything, (), length=0)  # one for each part; empty means zeros
 
 
 def scaled(value: PerSection, factor: float) -> PerSection:
@@ -138,62 +114,60 @@ def scaled(value: PerSection, factor: float) -> PerSection:
     return tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
 
 
-def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:
+def read_fields(cls: type, data: Any, where: str) -> dict[str, Any]:
     """Return the keyword arguments of `cls` from a table, each checked against its rule.
+
+    `where` begins messages: the file, and the table with a dot at its end.
 
     Raises:
         SpecError: a field is missing, unknown or breaks its rule.
     """
     if not isinstance(data, dict):
-        raise SpecError(f"{source}: {prefix.rstrip('.') or 'specification'}: got {data!r}, expected a table")
+        raise SpecError(f"{where.rstrip('.: ')}: got {data!r}, expected a table")
     # Refuse unknown fields.
     known = [item.name for item in fields(cls)]
     for name in data:
         if name not in known:
-            raise SpecError(f"{source}: {prefix}{name}: got an unknown field, expected {', '.join(known)}")
+            raise SpecError(f"{where}{name}: got an unknown field, expected {', '.join(known)}")
     # Read each field: a default, a table of its own, or numbers.
     hints = typing.get_type_hints(cls)
     values: dict[str, Any] = {}
     for item in fields(cls):
-        path = prefix + item.name
+        path = where + item.name
         group: Any = hints[item.name] if dataclasses.is_dataclass(hints[item.name]) else None
         if item.name not in data:
             if item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING:
                 continue
             expected = "a table" if group else rule_of(item).text
-            raise SpecError(f"{source}: {path}: got nothing, expected {expected}")
+            raise SpecError(f"{path}: got nothing, expected {expected}")
         value = data[item.name]
         if (kinds := item.metadata.get("kinds")) and isinstance(value, dict):
             value = dict(value)
             kind = value.pop("kind", next(iter(kinds)))
             if not isinstance(kind, str) or kind not in kinds:
-                raise SpecError(f"{source}: {path}.kind: got {kind!r}, expected {' or '.join(kinds)}")
+                raise SpecError(f"{path}.kind: got {kind!r}, expected {' or '.join(kinds)}")
             group = kinds[kind]
         if group is not None:
-            values[item.name] = group(**read_fields(group, value, source, path + "."))
+            values[item.name] = group(**read_fields(group, value, path + "."))
         else:
-            values[item.name] = _read_value(rule_of(item), value, source, path)
+            values[item.name] = _read_value(rule_of(item), value, path)
     return values
 
 
-def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -> None:
+def check_counts(table: Any, counts: dict[str, int], where: str) -> None:
     """Raise SpecError for a list whose length is not the number of the arm's parts that it describes.
 
-    The fields of the dataclass `table` have rules, or are such dataclasses. `counts` are by the names that
-    rules have for parts. For the message there are source and prefix, the table's name with a dot or empty.
+    `counts` are by the names that rules have for parts; `where` is that of `read_fields`.
     """
     for item in fields(table):
         value, rule = getattr(table, item.name), rule_of(item)
         if dataclasses.is_dataclass(value):
-            check_counts(value, counts, source, f"{prefix}{item.name}.")
+            check_counts(value, counts, f"{where}{item.name}.")
             continue
         is_list = rule.per and isinstance(value, tuple) and value != item.default
         if is_list and len(value) != (n := counts[rule.per]):
-            instead = "one, or " if rule.length is None else ""
-            raise SpecError(
-                f"{source}: {prefix}{item.name}: got {len(value)} numbers, "
-                f"expected {instead}one for each of the {n} {rule.per}"
-            )
+            expected = f"{'one, or ' if rule.length is None else ''}one for each of the {n} {rule.per}"
+            raise SpecError(f"{where}{item.name}: got {len(value)} numbers, expected {expected}")
 
 
 def rule_of(item: dataclasses.Field) -> Rule:
@@ -201,17 +175,17 @@ def rule_of(item: dataclasses.Field) -> Rule:
     return item.metadata.get("rule", Rule(kind=str))
 
 
-def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
+def _read_value(rule: Rule, value: Any, path: str) -> Any:
     many = isinstance(value, (list, tuple)) and (rule.per or rule.length is not None)
     items: Any = value if many else [value]
     if rule.length is not None and not (many and len(value) == (rule.length or len(value))):
-        raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
+        raise SpecError(f"{path}: got {value!r}, expected {rule.text}")
     for k, item in enumerate(items):
         if not rule.accepts(item):
             place = f"{path}[{k}]" if many else path
-            raise SpecError(f"{source}: {place}: got {item!r}, expected {rule.text}")
+            raise SpecError(f"{place}: got {item!r}, expected {rule.text}")
     if rule.kind is float and not all(x == 0.0 or FLOAT32_MIN <= abs(x) <= FLOAT32_MAX for x in items):
         sizes = f"sizes from {FLOAT32_MIN:.2g} to {FLOAT32_MAX:.2g}, which float32 holds"
-        raise SpecError(f"{source}: {path}: got {value!r}, expected {sizes}")
+        raise SpecError(f"{path}: got {value!r}, expected {sizes}")
     numbers = tuple(map(rule.kind, items))
     return numbers if many else numbers[0]

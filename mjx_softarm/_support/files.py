@@ -11,11 +11,7 @@ from typing import Any
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a path beside a file to write to, which replaces the file at the end; an error leaves the file.
-
-    Raises:
-        OSError: the file cannot be replaced.
-    """
+    """Give a path to write to, which replaces the file at the end; an error leaves the file as it was."""
     part = path.with_name(path.name + ".part")
     try:
         yield part

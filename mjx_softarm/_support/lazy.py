@@ -1,8 +1,4 @@
-"""Modules that are imported when they are first used, so that commands without them begin quickly.
-
-MuJoCo and MJX take more than a second, and calibration seldom needs them. `mujoco.mjx`, which brax imports,
-prints two lines at import if warp is not installed. Nothing needs it, so these lines are held back.
-"""
+"""Modules that are imported when they are first used: MuJoCo and MJX take more than a second."""
 
 from __future__ import annotations
 
@@ -15,8 +11,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import jax
-
-__all__ = ["LazyModule", "brax_envs", "mjx", "mujoco", "put"]
 
 
 class LazyModule:
@@ -48,6 +42,7 @@ def _keep_bodies_apart() -> None:
 
 @functools.cache
 def _import_quietly(name: str) -> Any:
+    """Import a module; without warp, which nothing needs, `mujoco.mjx` would print two lines."""
     with contextlib.redirect_stdout(io.StringIO()) as said:
         module = importlib.import_module(name)
     for line in said.getvalue().splitlines():

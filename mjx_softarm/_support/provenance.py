@@ -19,14 +19,13 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-che
 
 
 def provenance(program: str) -> dict[str, Any]:
-    """Return versions, machine and commit; changed files in docs/results do not count as uncommitted.
-
-    An installed package has no commit, not even where its environment lies within somebody's repository.
-    """
-    versions, commit, status = {}, None, None
+    """Return versions, machine and commit; changed files in docs/results do not count as uncommitted."""
+    commit = status = None
+    # An installed package has no commit, not even where it lies within somebody's repository.
     if _git("ls-files", "--error-unmatch", Path(__file__).name) is not None:
         commit = _git("rev-parse", "HEAD")
         status = _git("status", "--porcelain", "--", ":/", ":(top,exclude)docs/results")
+    versions = {}
     for name in PACKAGES:
         try:
             versions[name] = metadata.version(name)

@@ -49,20 +49,16 @@ def eliminate(matrix: Array, columns: Array) -> Array:
     """Multiply the inverse of a matrix (n, n, *arms) by columns (n, k, *arms): Gauss-Jordan, no pivoting.
 
     It is meant for matrices that are symmetric positive definite, or nearly: the response of a settling arm's
-    springs to its chambers, with rows of the identity for chambers at a limit.
-
-    Returns:
-        (n, k, *arms), all NaN if a pivot is not positive. A symmetric matrix that is not positive definite
-        has such a pivot.
+    springs to its chambers, with rows of the identity for chambers at a limit. All is NaN if a pivot is not
+    positive, as one is where a symmetric matrix is not positive definite.
     """
     return _eliminate_one(matrix, columns) if matrix.ndim == 2 else _eliminate(matrix, columns)
 
 
 def _eliminate(matrix: Array, columns: Array) -> Array:
-    """Do the work of `eliminate`, a block of columns at a time.
+    """Eliminate a block of columns at a time, so that each number is read and written a third as often.
 
-    So each number is read and written a third as often. Barriers keep the compiler from computing the pivots'
-    rows again for every other row.
+    Barriers keep the compiler from computing the pivots' rows again for every other row.
     """
     n = len(matrix)
     columns = jnp.broadcast_to(columns, (*columns.shape[:2], *matrix.shape[2:]))
@@ -79,7 +75,7 @@ _eliminate_one = rows_last(_eliminate)  # `jax.vmap` of it has the arms last
 
 
 def _inverse_last(matrix: Array) -> Array:
-    """Invert matrices (n, n, *arms) with positive pivots; n must be small, since every row is written out."""
+    """Invert small matrices (n, n, *arms) with positive pivots; every row is written out."""
     n = matrix.shape[0]
     beside = jnp.broadcast_to(identity(n, matrix), matrix.shape)
     rows = list(jnp.concatenate([matrix, beside], axis=1))

@@ -14,8 +14,6 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm._support.mlp import Layer
 
-STOP_EVERY = 10  # distance of the rows that stop the training, by default
-
 Weights = Any  # a tree of arrays
 
 
@@ -50,10 +48,10 @@ def train_network(
 
     Args:
         loss: mean loss () of weights on some rows.
-        weights: weights to start from.
-        rows: data, a tree of arrays (n, ...).
+        weights: where to start.
+        rows: tree of arrays (n, ...).
         schedule: course of the training.
-        key: key of the order of the rows.
+        key: of the order of the rows.
         stop (n,) bool: rows that stop the training early and are not learned from; by default every tenth.
 
     Returns:
@@ -61,7 +59,7 @@ def train_network(
     """
     # Split the rows into learned rows and stopping rows, and fill whole batches.
     n = len(jax.tree.leaves(rows)[0])
-    stops = np.arange(n) % STOP_EVERY == 0 if stop is None else stop
+    stops = np.arange(n) % 10 == 0 if stop is None else stop
     learned = jax.tree.map(lambda x: jnp.asarray(x)[~stops], rows)
     stopping = jax.tree.map(lambda x: jnp.asarray(x)[stops], rows)
     n_learned = int(np.count_nonzero(~stops))

@@ -34,7 +34,7 @@ _CPU_OPTIONS_OF: dict[Kind, dict[str, Any]] = {
 
 @functools.cache
 def compiler_options(kind: Kind = "arm") -> dict[str, Any]:
-    """Return the options for `jax.jit` that the installed jaxlib accepts; none on other devices than CPUs."""
+    """Return the options for `jax.jit` that the installed jaxlib accepts on CPUs; none for other devices."""
     if jax.default_backend() != "cpu":
         return {}
     accepted = {}
@@ -55,8 +55,8 @@ def jit(function: Callable, kind: Kind = "arm", **kwargs: Any) -> Callable:
     once, and "arm" for all others.
     """
 
-    # Set the current mesh. Where there is none, JAX sets an empty one while it applies custom rules of
-    # derivatives. Its cache of traces takes the two for different, and would trace helpers twice.
+    # Set the current mesh: where there is none, JAX sets an empty one while it applies custom rules of
+    # derivatives, and would trace helpers again.
     @functools.wraps(function)
     def traced(*args: Any, **kwargs: Any) -> Any:
         with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
@@ -66,9 +66,9 @@ def jit(function: Callable, kind: Kind = "arm", **kwargs: Any) -> Callable:
 
 
 def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:
-    """Return a compiled function's results for rows (n, ...), as NumPy arrays, from batches (size, ...).
+    """Return a compiled function's results for a tree of rows (n, ...), as NumPy, from batches (size, ...).
 
-    Rows are a tree of arrays, n at least 1, that become float32. The last batch repeats the first rows.
+    Rows become float32. The last batch repeats the first rows.
     """
     n = len(jax.tree.leaves(rows)[0])
     padded = jax.tree.map(lambda x: np.resize(np.float32(x), (-(-n // size) * size, *x.shape[1:])), rows)
@@ -112,10 +112,9 @@ def rows_last(function: Callable, n_at_once: int | None = None) -> Callable:
     return one
 
 
-def enable_compilation_cache() -> Path:
+def enable_compilation_cache() -> None:
     """Keep compiled programs in `$XDG_CACHE_HOME/mjx_softarm/xla` or `~/.cache`, for a fast second start."""
     path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx_softarm" / "xla"
     path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    return path

@@ -13,6 +13,7 @@ from mjx_softarm._support.fields import Amount, Count, PartialShare, Positive, S
 from mjx_softarm.mdp.observation import Observation
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.posture import hangs
 from mjx_softarm.spec import ArmSpec
 
 Engine = Literal["mjx", "chain", "mjx-step"]
@@ -74,18 +75,14 @@ class EnvConfig:
 
     @property
     def in_motion(self) -> bool:
-        """Whether the arm is in motion."""
         return self.mode == "dynamic"
 
     def arm(self, spec: ArmSpec, corrected: bool = False) -> ArmSpec:
-        """Return the arm as it is simulated.
-
-        Args:
-            spec: the arm.
-            corrected: whether it has a sim-to-real network, which holds for its own links alone.
+        """Return the arm as it is simulated; a sim-to-real network (`corrected`) holds for its own links.
 
         Raises:
-            InputError: a corrected arm is to have other links, or an action is shorter than a control period.
+            InputError: a corrected arm is to have other links, an action is shorter than a control period, or
+                an arm that does not hang is to enter a pipe.
         """
         period_s = 1.0 / spec.control.rate_hz
         links = spec.structure.links_per_section
@@ -93,6 +90,10 @@ class EnvConfig:
         required = {
             "dynamic_step_s": (self.dynamic_step_s >= period_s, f"{period_s:g} or more, a control period"),
             "links_per_section": (same or not corrected, f"{links}, as the sim-to-real network has"),
+            "pipe_diameter_mm": (
+                self.pipe is None or hangs(spec),
+                f"None, as {spec.name!r} does not hang, and pipes are entered from above",
+            ),
         }
         check_settings("EnvConfig", self, required)
         return spec if same else spec.replace(structure={"links_per_section": self.links_per_section})

@@ -15,6 +15,7 @@ false: leave such a step out of a replay buffer.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
@@ -44,11 +45,7 @@ Info = dict[str, Any]
 class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
     """Arms that reach for poses, stepped together; an episode that ends is followed by a new one at once.
 
-    Args:
-        num_envs: number of arms.
-        max_episode_steps: actions after which an episode is truncated.
-        arm: the paper's if None.
-        config: simulation, observation, reward and randomisation.
+    `arm` is the paper's by default, and `max_episode_steps` the actions after which an episode is truncated.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -61,7 +58,7 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         config: EnvConfig | None = None,
     ):
         self.num_envs = num_envs
-        self.env = _reach_env(arm or ArmSpec.default(), config or EnvConfig())
+        self.env = ReachEnv(arm, config)
         self.single_observation_space, self.single_action_space = spaces(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -103,28 +100,19 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         return obs, reward, terminated, truncated, infos
 
     def _traced_step(self, state: State, actions: Array, key: Array) -> tuple[State, tuple]:
-        following, after, outcome = self._arms.step(state, actions, key)
-        ends = outcome.terminated, outcome.truncated | ~outcome.valid
+        following, after, terminated, truncated = self._arms.step(state, actions, key)
+        ends = terminated, truncated | ~after.info["valid"]
         infos = _reset_info(following), _step_info(after)
-        return following, (following.obs, outcome.reward, *ends, *infos, outcome.final_obs)
+        return following, (following.obs, after.reward, *ends, *infos, after.obs)
 
 
 class SoftArmEnv(gymnasium.Env):
-    """One arm that reaches for poses, without a time limit: `gymnasium.make` adds it.
-
-    Args:
-        arm: the paper's if None.
-        config: simulation, observation, reward and randomisation.
-    """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    """One arm, by default the paper's, that reaches for poses; `gymnasium.make` adds a time limit."""
 
     def __init__(self, arm: ArmSpec | None = None, config: EnvConfig | None = None):
-        arm, config = arm or ArmSpec.default(), config or EnvConfig()
-        self.env = _reach_env(arm, config)
+        self.env, self._reset_arm, self._step_arm = _compiled(arm, config)
         self.observation_space, self.action_space = spaces(self.env)
         self._state: State | None = None
-        self._reset_arm, self._step_arm = _compiled(arm, config)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode; a seed fixes all that follows. There are no options."""
@@ -151,7 +139,6 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
     """
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
-    # Methods that reset and step, then methods for single arms, which are refused
     class SB3VecEnv(VecEnv):
         def __init__(self):
             super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
@@ -185,8 +172,7 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
             raise NotImplementedError(f"{attr_name}: the arms are one compiled program, set it on a new one")
 
         def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-            text = "the arms are one compiled program, without methods each"
-            raise NotImplementedError(f"{method_name}: {text}")
+            raise NotImplementedError(f"{method_name}: the arms are one program, without methods each")
 
         def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
             return [False] * len(list(self._get_indices(indices)))
@@ -197,28 +183,23 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
 def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Return the spaces of observations and actions; no section stretches to twice its length at rest."""
     rest_mm = 1e3 * env.spec.length_m
-    # Limits of a pose, whose angles are from the straight arm's
     limit = 1.01 * np.array([2 * rest_mm] * 3 + [180.0] * 3)
     centre = np.append(env.scale.centre[:3], np.zeros(3))
     # Positions differ by up to twice as much; angles wrap
     error = np.array(env.config.reward.weights) * np.array([2.0] * 3 + [1.0] * 3) * limit
-    low, high = ((limit_ - centre) / env.scale.scale for limit_ in (-limit, limit))
+    low, high = (-limit - centre) / env.scale.scale, (limit - centre) / env.scale.scale
     more = np.full(env.observation_size - OBS_SIZE, np.inf)  # payload, or speeds: no bounds are known
-    low, high = (
-        np.concatenate(part).astype(np.float32)
-        for part in ([low, low, -error, -more], [high, high, error, more])
-    )
-    return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
-
-
-_reach_env = functools.lru_cache(maxsize=8)(ReachEnv)
+    least = np.concatenate([low, low, -error, -more]).astype(np.float32)
+    greatest = np.concatenate([high, high, error, more]).astype(np.float32)
+    actions = gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
+    return gymnasium.spaces.Box(least, greatest), actions
 
 
 @functools.lru_cache(maxsize=8)
-def _compiled(arm: ArmSpec, config: EnvConfig) -> tuple:
-    """Return reset and step of one arm, compiled once for all environments that share arm and config."""
-    env = _reach_env(arm, config)
-    return xla.jit(env.reset), xla.jit(env.step)
+def _compiled(arm: ArmSpec | None, config: EnvConfig | None) -> tuple[ReachEnv, Callable, Callable]:
+    """Return an environment, its reset and its step, compiled once for all that share arm and config."""
+    env = ReachEnv(arm, config)
+    return env, xla.jit(env.reset), xla.jit(env.step)
 
 
 def _reset_info(state: State) -> dict[str, Array]:

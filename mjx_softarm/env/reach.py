@@ -1,8 +1,6 @@
 """One arm that reaches for poses: a brax environment with the paper's state, action and reward.
 
-An action is one sensor reading per spring, scaled to [-1, 1]; the sensor-space law turns it into pressures.
-`mode="quasistatic"` goes to the equilibrium at once; `mode="dynamic"` moves the arm, with chambers that fill.
-MJX simulates both, see `EnvConfig.engine`.
+The sensor-space law turns an action into pressures; the arm goes to its equilibrium at once, or moves.
 """
 
 from __future__ import annotations
@@ -21,10 +19,9 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
-from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.lazy import brax_envs, put
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeMotion, EpisodeNoise, State
+from mjx_softarm.env.state import ArmState, State, motion_params, nominal_share
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
@@ -32,16 +29,17 @@ from mjx_softarm.mechanics import mjx_rest
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.motion import midpoint, mjx_step
-from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm, Path
+from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm, n_earlier
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
-from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
+from mjx_softarm.mechanics.pipe import body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, arms_at_once, settle
 from mjx_softarm.mechanics.workspace import Pool, Seed, sample_evenly, sample_workspace
-from mjx_softarm.posture import hangs
+from mjx_softarm.pneumatics import Actuators, Regulator
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.spec import ArmSpec
 
+PAYLOAD_SHARE = 2  # index of the payload in the numbers of `ReachEnv.sample_noise`
 POOL_SEED = 0  # of the poses that starts and goals are drawn from; not that of held-out ones
 CLEARANCE_MARGIN_MM = 10.0  # clearance of the body to the wall from which there is no cost
 
@@ -50,17 +48,11 @@ class PosePool:
     """Poses of the workspace, a share of them uniform in volume; they are settled at the first use.
 
     A compiled function that takes them as an argument is compiled while they settle, and is the same program
-    for all pools of one size.
-
-    Args:
-        spec: the arm.
-        config: number of poses, share and seed.
-        observed: function from poses and spring lengths to the poses that are observed.
+    for all pools of one size. `observed` maps poses and spring lengths to the poses that are observed.
     """
 
     def __init__(self, spec: ArmSpec, config: EnvConfig, observed: Callable[[Array, Array], Array]):
         self._spec, self._config, self._observed = spec, config, observed
-        self._settled = functools.cache(lambda: self.draw(POOL_SEED))
         self._given = ContextVar[Pool | None]("pool", default=None)
         sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
         shapes: Any = (jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes)
@@ -68,10 +60,12 @@ class PosePool:
 
     def __call__(self) -> Pool:
         """Return the poses."""
-        if (given := self._given.get()) is not None:
-            return given
+        return self._given.get() or self._settled
+
+    @functools.cached_property
+    def _settled(self) -> Pool:
         with ThreadPoolExecutor(1) as elsewhere:  # the first use may be in a function that is traced
-            return elsewhere.submit(self._settled).result()
+            return elsewhere.submit(self.draw, POOL_SEED).result()
 
     @contextlib.contextmanager
     def given(self, pool: Pool) -> Iterator[None]:
@@ -90,10 +84,7 @@ class PosePool:
         return jax.device_put(jax.tree.map(lambda *part: np.concatenate(part), *parts))
 
     def sample(self, n: int, seed: Seed, evenly: bool = False) -> Pool:
-        """Draw n poses with `sample_workspace` or `sample_evenly`, as they are observed, as NumPy arrays.
-
-        NumPy, because JAX compiles a program for each operation outside of a compiled function.
-        """
+        """Draw n poses, as they are observed, as NumPy arrays: JAX would compile each operation on them."""
         pool = (sample_evenly if evenly else sample_workspace)(self._spec, n, seed)
         return pool._replace(pose=np.float32(self._observed(pool.pose, pool.spring_m)))
 
@@ -112,7 +103,7 @@ class ReachEnv(brax_envs.Env):
 
     Action (n_springs,), each in [-1, 1]: sensor readings that the sensor-space law is to reach, from the
         reading of the shortest to that of the longest spring (`mjx_softarm.mdp.actions`)
-    Reward (), without unit: the sum of the terms of `mjx_softarm.mdp.rewards.reward`
+    Reward (), without unit: `mjx_softarm.mdp.rewards.reward`
     Done (): 1 where the goal is reached with no chamber saturated, or where the simulation failed
 
     Info:
@@ -141,16 +132,11 @@ class ReachEnv(brax_envs.Env):
         self.params = jax.device_put(ArmParams.from_spec(self.spec))
         self.scale = obs.ObsScale.from_spec(self.spec)
         self.gains = control.Gains.from_spec(self.spec)
-        self.episode_motion = EpisodeMotion(self.spec, self.config)
+        actuators = self.spec.actuators.per_chamber(self.spec.n_chambers)
+        self.actuators: Actuators = jax.device_put(jax.tree.map(np.float32, actuators))
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *jax.device_put([np.float32(limit) for limit in limits]))
         self.pipe = self.config.pipe
-        if self.pipe is not None and not hangs(self.spec):
-            raise InputError(
-                f"pipe_diameter_mm: got {1e3 * self.pipe.diameter_m:g} for the arm {self.spec.name!r}, whose "
-                f"base is turned by {self.spec.mounting.base_turn_deg} deg, expected an arm that hangs: "
-                "pipes are entered from above"
-            )
 
         # Simulation, and the poses that starts and goals are drawn from
         self.uses_mjx = self.config.engine != "chain"
@@ -189,11 +175,10 @@ class ReachEnv(brax_envs.Env):
 
     @property
     def backend(self) -> str:
-        """Simulation that runs: the engine, at rest or in motion."""
-        return f"{self.config.engine} dynamic" if self.config.in_motion else self.config.engine
+        return self.config.engine
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
-        """Return the pose as it is observed: corrected, if there is a sim-to-real network."""
+        """Return the pose, corrected if there is a sim-to-real network."""
         if self.s2r is None:
             return pose
         with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
@@ -209,34 +194,41 @@ class ReachEnv(brax_envs.Env):
 
     def reset(self, rng: Array) -> State:
         """Start an episode: an arm of the randomisation, at a random pose, with a random goal."""
-        return self.reset_from(jax.tree.map(lambda x: x[0], self.sample_noise(rng, 1)))
+        return self.reset_from(self.sample_noise(rng, 1)[0])
 
-    def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
-        """Draw the random numbers of n episodes: leaves (n, ...)."""
-        key, shape = jax.random.fold_in(rng, 1), (n, self.episode_motion.n_draws)
-        moving = draws.uniform(key, shape) if self.config.in_motion else None
-        return EpisodeNoise(draws.uniform(rng, (n, 3 + self.spec.n_chambers)), moving)
+    def sample_noise(self, rng: Array, n: int) -> Array:
+        """Draw the numbers from 0 to 1 that fix n episodes, a row each.
 
-    def reset_from(self, noise: EpisodeNoise) -> State:
-        """Start the episode that `noise` fixes."""
+        They are start, goal, payload, the stiffness of each chamber, and `share` of `motion_params`.
+        """
+        moving = jnp.tile(nominal_share(self.actuators), (n, 1))
+        if self.config.in_motion:
+            moving = draws.uniform(jax.random.fold_in(rng, 1), moving.shape)
+        return jnp.concatenate([draws.uniform(rng, (n, 3 + self.spec.n_chambers)), moving], axis=1)
+
+    def reset_from(self, share: Array) -> State:
+        """Start the episode that a row of `sample_noise` fixes."""
         # Start and goal, and the arm of this episode
-        share = noise.uniform
         start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
         pool = self.pool
         start = jax.tree.map(lambda x: x[start_row], pool)
         goal = pool.pose[goal_row]
         spread = self.config.randomisation
-        factor = 1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)
+        stiffness, moving = jnp.split(share[3:], [self.spec.n_chambers])
+        factor = 1.0 + spread.stiffness_spread * (2.0 * stiffness - 1.0)
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],
             chamber_stiffness=self.params.stiffened(factor).chamber_stiffness,
-            moving=self.episode_motion.params(noise.moving),
-            **self.episode_motion.at_rest(start),
+            moving=motion_params(self.actuators, spread, moving),
+            motion=self._resting(start),
+            pose=start.pose,
+            spring_m=start.spring_m,
+            pressure_kpa=start.pressure_kpa,
             sensed=None,
             goal=goal,
             n_steps=jnp.zeros((), jnp.int32),
         )
-        arm = self.put(arm, start)
+        arm = arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m)))
 
         # Metrics and info of an episode without a step
         zero = jnp.zeros(())
@@ -250,10 +242,16 @@ class ReachEnv(brax_envs.Env):
             info["path_mm"] = jnp.zeros((self.n_ticks, 3))
         return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
 
-    def put(self, arm: ArmState, equilibrium: Pool) -> ArmState:
-        """Return an arm at rest at an equilibrium, a row of a pool."""
-        arm = arm._replace(**self.episode_motion.at_rest(equilibrium))
-        return arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m)))
+    def _resting(self, start: Pool) -> Motion:
+        """Return the state of an arm at rest at a row of a pool."""
+        equilibrium = start.q, start.pressure_kpa, start.spring_m
+        if not self.config.in_motion:
+            return Motion.at_rest(*equilibrium)
+        spread, actuators = self.config.randomisation, self.spec.actuators
+        factor = 1.0 + spread.regulator_spread * isinstance(actuators, Regulator)
+        longest_s = factor * float(np.max(actuators.delay_s)) + spread.delay_max_s  # of all episodes
+        n_waiting = n_earlier(longest_s, 1.0 / self.spec.control.rate_hz)
+        return Motion.at_rest(*equilibrium, n_waiting, self.actuators.rest_offset_kpa)
 
     def step(self, state: State, action: Array) -> State:
         """Move to the references of `action` (n_springs,) in [-1, 1]; `done` is 1 where the goal is reached.
@@ -310,7 +308,7 @@ class ReachEnv(brax_envs.Env):
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | MotionEnd]:
-        """Move to true spring lengths (n_springs,): return the motion and the observables at its end."""
+        """Move to spring lengths (n_springs,); return the motion and the observables at its end."""
         params, config = self.params_of(arm), self.config
         if config.in_motion:
             moving = MovingArm(self.model, self._data, params, arm.moving)
@@ -325,37 +323,29 @@ class ReachEnv(brax_envs.Env):
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
     def _way(self, arm: ArmState, end: Settled | MotionEnd, valid: Array) -> dict[str, Array]:
-        """Return the clearance and, in motion, the path of `info`."""
+        """Return `clearance_mm` and, in motion, `path_mm` of `info`."""
         clearance_mm = self._clearance_mm(arm.motion.q, arm.pose)
         if not isinstance(end, MotionEnd):
             return {"clearance_mm": clearance_mm}
-        tips = pose_from_frame(end.path.tip_position_m, end.path.tip_rotation)
-        pose = self._observed_pose(tips, end.path.spring_m)  # (n_ticks, 6)
-        least_mm = jnp.minimum(clearance_mm, self._least_clearance_mm(end.path, pose))
+        path = end.path
+        tips = pose_from_frame(path.tip_position_m, path.tip_rotation)
+        pose = self._observed_pose(tips, path.spring_m)  # (n_ticks, 6)
+        way_mm = self._body_clearance_mm(path.plate_position_m, path.plate_rotation, pose)  # start included
+        least_mm = jnp.min(way_mm[1:], initial=clearance_mm)
         return {"path_mm": pose[:, :3], "clearance_mm": jnp.where(valid, least_mm, clearance_mm)}
 
     def _clearance_mm(self, q: Array, pose: Array) -> Array:
-        """Return the distance () of the body to the pipe at coordinates (nv,), with its tip at a pose (6,).
-
-        Without a pipe, distances are infinite.
-        """
-        if self.pipe is None:
-            return jnp.asarray(jnp.inf, q.dtype)
+        """Return the clearance () at joint coordinates (nv,), with the tip at a pose (6,)."""
         frames = chain_kinematics(self.params)(q)
-        return self._of_plates(self.pipe, frames.plate_position, frames.plate_rotation, pose)
+        return self._body_clearance_mm(frames.plate_position, frames.plate_rotation, pose)
 
-    def _least_clearance_mm(self, path: Path, pose: Array) -> Array:
-        """Return the least distance () along a path whose tips have poses (t, 6), without its start."""
-        if self.pipe is None or len(pose) == 1:  # nothing between start and end
-            return jnp.asarray(jnp.inf, pose.dtype)
-        plates = path.plate_position_m[1:], path.plate_rotation[1:]
-        return jnp.min(self._of_plates(self.pipe, *plates, pose[1:]))
-
-    def _of_plates(self, pipe: CrossPipe, position_m: Array, rotation: Array, pose: Array) -> Array:
-        """Return distances (...) [mm] of bodies with plates (..., n_links + 1), tips at poses (..., 6)."""
+    def _body_clearance_mm(self, position_m: Array, rotation: Array, pose: Array) -> Array:
+        """Return clearances (...) of bodies with plates (..., n_links + 1), tips at poses (..., 6)."""
+        if self.pipe is None:
+            return jnp.full(pose.shape[:-1], jnp.inf, pose.dtype)
         if self.s2r is not None:
             position_m, rotation = carry_body(position_m, rotation, pose)
-        return 1e3 * body_clearance(pipe, position_m, rotation, self.spec)
+        return 1e3 * body_clearance(self.pipe, position_m, rotation, self.spec)
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
         """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""
@@ -368,7 +358,7 @@ class ReachEnv(brax_envs.Env):
         return observed if sensed is None else jnp.concatenate([observed, sensed], axis=-1)
 
     def _sensed(self, arm: ArmState, end: ArmState | Settled | MotionEnd, action: Array) -> Array | None:
-        """Return `ArmState.sensed`; without a motion before it, the arm is at rest and its rates are zero."""
+        """Return `ArmState.sensed`; without a motion before it, rates are zero."""
         if self.config.observation == "pose":
             return None
         if self.config.observation == "payload":
@@ -382,7 +372,7 @@ class ReachEnv(brax_envs.Env):
         return obs.observe_motion(arm.spring_m, last_m, tip_mm, last_mm, held_kpa, action, self.spec)
 
     def params_of(self, arm: ArmState) -> ArmParams:
-        """Return the parameters of an arm, with those of its episode in their places."""
+        """Return the parameters of an arm in its episode."""
         return self.params._replace(
             tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].set(arm.payload_kg),
             chamber_stiffness=arm.chamber_stiffness,

@@ -1,4 +1,4 @@
-"""State of one arm of the environment, and the random numbers of its episode."""
+"""State of one arm of the environment, and the parameters of its motion in an episode."""
 
 from __future__ import annotations
 
@@ -8,29 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from mjx_softarm._support.lazy import brax_envs
-from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.mechanics.motion.state import Motion, MotionParams, n_earlier
-from mjx_softarm.mechanics.workspace import Pool
-from mjx_softarm.pneumatics import Regulator
+from mjx_softarm.env.config import Randomisation
+from mjx_softarm.mechanics.motion.state import Motion, MotionParams
+from mjx_softarm.pneumatics import Actuators, Regulator
 from mjx_softarm.sensing.sensors import SENSORS
-from mjx_softarm.spec import ArmSpec
 
 for _sensor in SENSORS.values():
     jax.tree_util.register_dataclass(_sensor)  # its numbers are traced
-
-
-PAYLOAD_SHARE = 2  # index in `EpisodeNoise.uniform`
-
-
-class EpisodeNoise(NamedTuple):
-    """Random numbers that fix one episode."""
-
-    uniform: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
-    moving: Array | None  # (EpisodeMotion.n_draws,) from 0 to 1; None for arms at rest
 
 
 class ArmState(NamedTuple):
@@ -60,49 +47,30 @@ class State(brax_envs.State):
         def replace(self, **fields: Any) -> State: ...
 
 
-class EpisodeMotion:
-    """Parameters and states at rest of the arms of a configuration, which may be in motion."""
+def nominal_share(actuators: Actuators) -> Array:
+    """Return the `share` of `motion_params` that gives the nominal parameters."""
+    return jnp.array([0.5, 0.0, 0.0] + [0.5] * 3 * isinstance(actuators, Regulator))
 
-    def __init__(self, spec: ArmSpec, config: EnvConfig):
-        self._spread, actuators = config.randomisation, spec.actuators.per_chamber(spec.n_chambers)
-        self._regulated = isinstance(actuators, Regulator)
-        self._actuators: Any = jax.device_put(jax.tree.map(np.float32, actuators))
-        self.n_draws = 6 if self._regulated else 3  # random numbers of an episode
 
-        # Commands that wait at a time, and those of an arm at rest; an arm that is always at rest needs none
-        spread = 1.0 + self._spread.regulator_spread * self._regulated
-        longest_s = spread * float(np.max(actuators.delay_s)) + self._spread.delay_max_s
-        self.n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.in_motion else 0
-        self._offset_kpa = self._actuators.rest_offset_kpa if config.in_motion else None
+def motion_params(actuators: Actuators, spread: Randomisation, share: Array) -> MotionParams:
+    """Return the parameters of an arm's motion in an episode.
 
-    def params(self, share: Array | None) -> MotionParams:
-        """Return the parameters of an episode.
-
-        Args:
-            share (n_draws,): random numbers from 0 to 1: damping, delay and friction, then lag, dead time and
-                rates of regulators. None gives the nominal parameters.
-        """
-        spread, actuators = self._spread, self._actuators
-        damping, delay, friction = jnp.array([0.5, 0.0, 0.0]) if share is None else share[:3]
-        delay_s = actuators.delay_s
-        if self._regulated and share is not None:
-            lag, dead_time, rate = 1.0 + spread.regulator_spread * (2.0 * share[3:] - 1.0)
-            rates = {name: rate * getattr(actuators, name) for name in ("fill_kpa_per_s", "vent_kpa_per_s")}
-            actuators = dataclasses.replace(actuators, lag_s=lag * actuators.lag_s, **rates)
-            delay_s = dead_time * delay_s
-        return MotionParams(
-            damping=1.0 + spread.damping_spread * (2.0 * damping - 1.0),
-            delay_s=delay_s + spread.delay_max_s * delay,
-            friction_n=spread.friction_max_n * friction,
-            actuators=actuators,
-        )
-
-    def at_rest(self, equilibrium: Pool) -> dict[str, Any]:
-        """Return the fields of `ArmState` that an equilibrium, a row of a pool, fixes."""
-        rest = equilibrium.q, equilibrium.pressure_kpa, equilibrium.spring_m
-        return {
-            "motion": Motion.at_rest(*rest, self.n_earlier, self._offset_kpa),
-            "pose": equilibrium.pose,
-            "spring_m": equilibrium.spring_m,
-            "pressure_kpa": equilibrium.pressure_kpa,
-        }
+    Args:
+        actuators: the nominal ones.
+        spread: differences between episodes.
+        share (k,): random numbers from 0 to 1: damping, delay and friction, then lag, dead time and rates of
+            regulators.
+    """
+    damping, delay, friction, *others = share
+    delay_s = actuators.delay_s
+    if isinstance(actuators, Regulator):
+        lag, dead_time, rate = (1.0 + spread.regulator_spread * (2.0 * x - 1.0) for x in others)
+        rates = {name: rate * getattr(actuators, name) for name in ("fill_kpa_per_s", "vent_kpa_per_s")}
+        actuators = dataclasses.replace(actuators, lag_s=lag * actuators.lag_s, **rates)
+        delay_s = dead_time * delay_s
+    return MotionParams(
+        damping=1.0 + spread.damping_spread * (2.0 * damping - 1.0),
+        delay_s=delay_s + spread.delay_max_s * delay,
+        friction_n=spread.friction_max_n * friction,
+        actuators=actuators,
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,16 +17,6 @@ def choose_arms(chosen: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(chosen.reshape((-1,) + (1,) * (x.ndim - 1)), x, y), yes, no)
 
 
-class Outcome(NamedTuple):
-    """Outcome of one action of each arm, before any reset."""
-
-    final_obs: Array  # (n, obs_size) the successor's observation, also where the episode ended
-    reward: Array  # (n,)
-    terminated: Array  # (n,) bool: goal reached; the value after it is zero
-    truncated: Array  # (n,) bool: time limit reached; the value after it is that of `final_obs`
-    valid: Array  # (n,) bool: the simulation succeeded; else the step must not be learned from
-
-
 class VectorEnv:
     """Independent arms; an arm whose episode ended starts a new one, with a new goal."""
 
@@ -37,7 +27,7 @@ class VectorEnv:
         """Start an episode with each of the n arms."""
         return jax.vmap(self.env.reset_from)(self.env.sample_noise(key, self.n))
 
-    def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:
+    def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Array, Array]:
         """Act once.
 
         Args:
@@ -46,8 +36,9 @@ class VectorEnv:
             key: for the new episodes.
 
         Returns:
-            The state to act on next (reset where an episode ended), the state that the action led to,
-            and the outcome.
+            The state to act on next, reset where an episode ended; the state that the action led to;
+            terminated (n,): goal reached, so that the value after it is zero; truncated (n,): time limit
+            reached, so that the value after it is that of the state that the action led to.
         """
         # Act, and see whose episode is over
         after = jax.vmap(self.env.step)(state, action)
@@ -58,4 +49,4 @@ class VectorEnv:
 
         # New episodes where the last one is over; metrics are always those of the action
         following = choose_arms(over, self.reset(key), after).replace(metrics=after.metrics)
-        return following, after, Outcome(after.obs, after.reward, terminated, truncated, valid)
+        return following, after, terminated, truncated

@@ -23,7 +23,7 @@ SHIFT_LIMIT = np.repeat([25.0, 5.0], 3)
 
 
 class ActionMap(NamedTuple):
-    """Map between the actions of n springs, their readings and their lengths. NumPy and JAX."""
+    """Map between the actions of n springs, their readings and their lengths."""
 
     sensor: Sensor
     low: Array  # (n,) readings that the action -1 asks for

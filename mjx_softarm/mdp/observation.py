@@ -1,7 +1,4 @@
-"""Observation: pose, goal and scaled error, one function for training, twin and deployed arm.
-
-A policy may also observe the payload; or, in motion, the spring lengths and their rates, the tip's velocity,
-the law's integral and the last action.
+"""Observation: pose, goal and scaled error; a policy may also observe the payload, or motion.
 
 Source: the paper's state s = (P, g, e) in R^18. A fixed affine map brings pose and goal to the order of one,
 the range that networks learn in.
@@ -50,11 +47,7 @@ def layouts(spec: ArmSpec) -> dict[Observation, tuple[str, ...]]:
     )
     integrals = [f"integral_{k}" for k in range(spec.n_chambers)]
     motion = *springs, *rates, *(f"velocity_{axis}" for axis in "xyz"), *integrals, *actions
-    return {
-        "pose": OBS_LAYOUT,
-        "payload": (*OBS_LAYOUT, "payload_kg"),
-        "motion": (*OBS_LAYOUT, *motion),
-    }
+    return {"pose": OBS_LAYOUT, "payload": (*OBS_LAYOUT, "payload_kg"), "motion": (*OBS_LAYOUT, *motion)}
 
 
 def rate_ticks(rate_hz: float) -> int:
@@ -81,9 +74,9 @@ def observe_motion(
 
     Args:
         spring_m (..., n_springs) [m]: lengths that are read.
-        last_spring_m (..., n_springs) [m]: lengths that were read `rate_ticks` before.
+        last_spring_m (..., n_springs) [m]: lengths `rate_ticks` before.
         tip_mm (..., 3) [mm]: position of the tip.
-        last_tip_mm (..., 3) [mm]: position of the tip `rate_ticks` before.
+        last_tip_mm (..., 3) [mm]: position `rate_ticks` before.
         integral_kpa (..., n_chambers) [kPa]: integral of the sensor-space law.
         action (..., n_springs): the last action, in [-1, 1].
         spec: the arm.
@@ -92,14 +85,12 @@ def observe_motion(
         Lengths, from -1 at the shortest to 1 at the longest; their rates; the tip's velocity; the integral,
         from -1 at the least to 1 at the greatest pressure; the action.
     """
-    # Ranges that are scaled to [-1, 1], and the time between the two lengths of a rate
     xp = array_namespace(spring_m, tip_mm, action)
     shortest, longest = (spec.at_springs(x) for x in (spec.springs.length_min_m, spec.springs.length_max_m))
     low, high, span = (xp.asarray(x, dtype=spring_m.dtype) for x in (shortest, longest, longest - shortest))
     least, greatest = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     over_s = rate_ticks(spec.control.rate_hz) / spec.control.rate_hz
 
-    # Observations in their order
     lengths = (2.0 * spring_m - low - high) / span
     rates = (spring_m - last_spring_m) / (over_s * SPRING_M_PER_S)
     velocity = (tip_mm - last_tip_mm) / (over_s * TIP_MM_PER_S)

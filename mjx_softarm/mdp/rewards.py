@@ -57,25 +57,19 @@ class RewardConfig:
 
 
 def scaled_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
-    """Return e = w (pose - goal), (..., 6) without unit, angles wrapped.
-
-    Args:
-        pose (..., 6) [mm, deg]: pose of the tip.
-        goal (..., 6) [mm, deg]: target of the tip.
-        config: the weights.
-    """
+    """Return e = w (pose - goal), (..., 6) without unit, for poses (..., 6) [mm, deg]; angles wrap."""
     xp = array_namespace(pose)
     return xp.asarray(list(config.weights), dtype=pose.dtype) * pose_error(pose, goal)
 
 
 def weighted_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
-    """Return the weighted error (...): the norm of `scaled_error`, with the same arguments."""
+    """Return the weighted error (...): the norm of `scaled_error`."""
     xp = array_namespace(pose)
     return xp.sqrt(xp.sum(scaled_error(pose, goal, config) ** 2, axis=-1))
 
 
 def asked_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
-    """Return pose - goal (..., 6) [mm, deg], angles wrapped, zero on axes that the goal does not ask for."""
+    """Return pose - goal (..., 6) [mm, deg], angles wrapped, zero on axes that goals do not ask for."""
     error = pose_error(pose, goal)
     xp = array_namespace(error)
     return error if all(config.asked) else xp.where(np.array(config.asked), error, 0.0)

@@ -10,6 +10,8 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.spec import ArmSpec
 
 REFUSED = [
+    ({"reward": RewardConfig(threshold=math.inf)}, r"\.threshold: got inf, expected a number >"),
+    ({"reward": RewardConfig(axes=(0.0,) * 6)}, r"axes: got .*, expected six finite numbers"),
     ({"mode": "static"}, r"EnvConfig\.mode: got 'static', expected one of"),
     ({"observation": "motion"}, "got 'motion', expected 'pose' or 'payload' for arms at rest"),
     ({"engine": "mjx-step"}, "engine: got 'mjx-step', expected one of .*'mjx', 'chain'"),
@@ -26,12 +28,12 @@ def test_settings_that_cannot_be_are_refused_by_name(settings, message):
         EnvConfig(**settings)
 
 
-@pytest.mark.parametrize("value", [math.inf, -1.0])
-def test_a_number_that_is_negative_or_not_finite_is_refused_by_name(value):
-    with pytest.raises(ValueError, match=rf"\.threshold: got {value}, expected a number >"):
-        EnvConfig(reward=RewardConfig(threshold=value))
-    with pytest.raises(ValueError, match=rf"\.payload_max_kg: got {value}, expected a number >"):
-        Randomisation(payload_max_kg=value)
+def test_a_negative_payload_is_refused_and_an_arm_that_stands_in_a_pipe():
+    with pytest.raises(ValueError, match=r"\.payload_max_kg: got -1.0, expected a number >"):
+        Randomisation(payload_max_kg=-1.0)
+    standing = ArmSpec.default().replace(mounting={"base_turn_deg": (180.0, 0.0, 0.0)})
+    with pytest.raises(ValueError, match="pipe_diameter_mm: got 300.0, expected None, as .* does not hang"):
+        EnvConfig(pipe_diameter_mm=300.0).arm(standing)
 
 
 def test_the_simulated_arm_may_have_fewer_links_than_the_specified_one():

@@ -13,15 +13,10 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import POOL_SEED
 from mjx_softarm.env.state import State
-from tests.arms import SHORT
+from tests.arms import SHORT, with_arm
 
 MM, KPA = 1e-3, 1.0
 SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2)
-
-
-def with_arm(state, **changes):
-    """The state with parts of its arms exchanged."""
-    return state.replace(pipeline_state=state.pipeline_state._replace(**changes))
 
 
 def numpy_error(pose, goal):
@@ -32,12 +27,7 @@ def numpy_error(pose, goal):
 
 
 def leaves_equal(a, b):
-    return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
-
-
-def types(state):
-    """Shapes and types; a jitted function is compiled anew where they differ."""
-    return jax.tree.map(jax.typeof, state)
+    return jax.tree.all(jax.tree.map(lambda x, y: np.array_equal(x, y, equal_nan=True), a, b))
 
 
 def test_an_action_scales_the_frequency_linearly_between_those_of_the_shortest_and_longest_spring(env, spec):
@@ -54,10 +44,8 @@ def test_an_action_scales_the_frequency_linearly_between_those_of_the_shortest_a
     assert actions[4] > 0.1  # the middle length is not the middle frequency
     np.testing.assert_allclose(env.reference_m(jnp.float32(actions)), lengths, atol=1e-6)
     np.testing.assert_allclose(env.action_of(jnp.float32(lengths)), actions, atol=1e-5)
-
-
-def test_actions_beyond_one_and_lengths_beyond_the_limits_are_clipped(env, spec):
-    shortest, longest = spec.springs.length_min_m, spec.springs.length_max_m
+    # Actions beyond one and lengths beyond the limits are clipped
+    shortest, longest = lengths[[0, -1]]
     np.testing.assert_allclose(env.reference_m(jnp.full(9, -3.0)), shortest, atol=1e-7)
     np.testing.assert_allclose(env.reference_m(jnp.full(9, 3.0)), longest, atol=1e-7)
     np.testing.assert_array_equal(env.action_of(jnp.full(9, 0.5 * shortest)), -1.0)
@@ -77,8 +65,7 @@ def test_starts_and_goals_are_drawn_from_the_pool_each_on_its_own(env, start):
 
 
 def test_a_share_of_the_poses_is_uniform_in_volume(spec):
-    config = EnvConfig(n_poses=48, even_share=0.25)
-    env = ReachEnv(spec, config)
+    env = ReachEnv(spec, EnvConfig(n_poses=48, even_share=0.25))
     plain, even = env.sample_pool(36, POOL_SEED), env.sample_pool(12, POOL_SEED, evenly=True)
     np.testing.assert_array_equal(env.pool.pose, np.concatenate([plain.pose, even.pose]))
     assert len(np.unique(env.pool.pose, axis=0)) > 40
@@ -87,12 +74,9 @@ def test_a_share_of_the_poses_is_uniform_in_volume(spec):
 def test_every_goal_is_reached_to_a_tenth_of_a_millimetre_with_no_chamber_saturated(env, start, step):
     after = step(with_arm(start, goal=env.pool.pose), env.action_of(env.pool.spring_m))
     assert float(after.metrics["tip_error_mm"].max()) < 0.1
-    angles = np.abs(numpy_error(after.pipeline_state.pose, env.pool.pose)[:, 3:]) / 0.001
-    assert angles.max() < 0.1
+    assert np.abs(numpy_error(after.pipeline_state.pose, env.pool.pose)[:, 3:]).max() < 1e-4  # 0.1 deg
     np.testing.assert_array_equal(after.metrics["saturated_chambers"], 0)
     np.testing.assert_array_equal(after.reward, 100.0)
-    np.testing.assert_array_equal(after.done, 1)
-    np.testing.assert_array_equal(after.metrics["reached"], 1)
 
 
 def test_observation_is_scaled_pose_scaled_goal_and_error(start, step, random_actions):
@@ -173,9 +157,7 @@ def test_an_arm_that_cannot_settle_keeps_its_pose_earns_nothing_and_ends_its_epi
     assert after.metrics["reached"] == 0  # it stands on its goal, but did not get there
     assert not after.info["saturated"] and after.metrics["saturated_chambers"] == 0
     assert all(after.metrics[name] == 0 for name in after.metrics if name.startswith("reward_"))
-    for name in ("pose", "spring_m", "pressure_kpa", "goal", "n_steps", "motion"):
-        unchanged = [getattr(state.pipeline_state, name) for state in (before, after)]
-        assert leaves_equal(*unchanged), name
+    assert leaves_equal(after.pipeline_state, before.pipeline_state)
     np.testing.assert_array_equal(after.obs, before.obs.at[6:12].set(before.obs[:6]).at[12:].set(0.0))
 
 
@@ -196,11 +178,10 @@ class Few(NamedTuple):
     after: State
 
 
-@pytest.fixture(
-    scope="module",
-    params=[SHORT, pytest.param(ArmSpec.default(), marks=pytest.mark.slow)],
-    ids=["short", "paper"],
-)
+ARMS = [pytest.param(SHORT, id="short"), pytest.param(ArmSpec.default(), id="paper", marks=pytest.mark.slow)]
+
+
+@pytest.fixture(scope="module", params=ARMS)
 def few(request, quick_compiler):
     env = ReachEnv(request.param, EnvConfig(engine="chain", n_poses=64, randomisation=SPREAD))
     fresh, step = compiled(env)
@@ -222,7 +203,7 @@ def test_engine_mjx_steps_like_engine_chain(few):
     fresh, step = compiled(env)
     assert leaves_equal(fresh, few.fresh)
     after = step(few.before, few.actions)
-    assert types(after) == types(few.before)
+    assert jax.tree.map(jax.typeof, after) == jax.tree.map(jax.typeof, few.before)
     # MJX in single precision: positions within a micrometre
     moved, proposed = after.pipeline_state, few.after.pipeline_state
     np.testing.assert_allclose(moved.pose[:, :3], proposed.pose[:, :3], atol=1e-3)
@@ -243,7 +224,7 @@ def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few, engine)
     before = few.before.replace(metrics=fresh.metrics, info=fresh.info)
     assert leaves_equal(fresh.pipeline_state, few.fresh.pipeline_state)
     first = now = step(before, few.actions)
-    assert types(first) == types(before)
+    assert jax.tree.map(jax.typeof, first) == jax.tree.map(jax.typeof, before)
     for _ in range(29):
         now = step(now, few.actions)
     moving, resting, truth = (
@@ -258,6 +239,4 @@ def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few, engine)
     # The fourth arm stays where it was, and its velocity and pressures do not turn into NaN.
     np.testing.assert_array_equal(first.info["valid"], [True, True, True, False])
     assert first.done[3] == 1 and first.reward[3] == 0
-    for name in ("motion", "pose", "n_steps"):
-        unchanged = [getattr(state.pipeline_state, name) for state in (few.before, now)]
-        assert leaves_equal(*jax.tree.map(lambda x: x[3], unchanged)), name
+    assert leaves_equal(*(jax.tree.map(lambda x: x[3], state.pipeline_state) for state in (few.before, now)))

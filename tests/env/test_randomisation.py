@@ -10,16 +10,11 @@ import pytest
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
-from mjx_softarm.env.state import EpisodeMotion
+from mjx_softarm.env.state import motion_params, nominal_share
 from mjx_softarm.mechanics.params import ArmParams
+from tests.arms import SHORT, with_arm
 
-MM = 1e-3
 SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2)
-
-
-def with_arm(state, **changes):
-    """The state with parts of its arms exchanged."""
-    return state.replace(pipeline_state=state.pipeline_state._replace(**changes))
 
 
 @pytest.fixture(scope="module")
@@ -30,16 +25,15 @@ def randomised(spec, env):
     return xla.jit(jax.vmap(spread.reset))(keys)
 
 
-def assert_all_arms_have(drawn, nominal, name):
-    for own, value in zip(jax.tree.leaves(drawn), jax.tree.leaves(nominal), strict=True):
-        np.testing.assert_array_equal(own, np.broadcast_to(value, own.shape), err_msg=name)
+def assert_all_arms_have(params, drawn):
+    def compare(value, own):
+        np.testing.assert_array_equal(own, np.broadcast_to(value, own.shape))
+
+    jax.tree.map(compare, params, drawn)
 
 
 def test_without_randomisation_every_arm_is_the_nominal_one(spec, env, start):
-    nominal = ArmParams.from_spec(spec)
-    drawn = jax.vmap(env.params_of)(start.pipeline_state)
-    for name in nominal._fields:
-        assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
+    assert_all_arms_have(ArmParams.from_spec(spec), jax.vmap(env.params_of)(start.pipeline_state))
 
 
 def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, env, randomised):
@@ -52,29 +46,23 @@ def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, 
     for value, low, high in ((payload, 0.0, 0.5), (factor, 0.8, 1.2)):
         assert np.count_nonzero(np.histogram(value, 100, (low, high))[0]) > 90
     assert np.ptp(factor, axis=1).min() > 0.02  # each chamber for itself
-    unchanged = {"tool_mass_kg", "chamber_stiffness"} ^ set(ArmParams._fields)
-    for name in unchanged:
-        assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
+    changed = {"tool_mass_kg": drawn.tool_mass_kg, "chamber_stiffness": drawn.chamber_stiffness}
+    assert_all_arms_have(nominal._replace(**changed), drawn)
     np.testing.assert_array_equal(drawn.tool_mass_kg[:, 0], np.float32(spec.mass.gripper_kg))
 
 
 def test_payloads_go_up_to_the_arm_s_largest_where_they_are_observed(spec):
     light = spec.replace(mass={"arm_kg": 1.0, "gripper_kg": 0.175})  # a quarter of the paper's arm
-    for observation, given_kg, expected_kg in (
-        ("payload", None, 0.25),
-        ("payload", 0.1, 0.1),
-        ("pose", None, 0),
-    ):
+    cases = ("payload", None, 0.25), ("payload", 0.1, 0.1), ("pose", None, 0)
+    for observation, given_kg, expected_kg in cases:
         spread = Randomisation(payload_max_kg=given_kg)
         env = ReachEnv(light, EnvConfig(n_poses=4, observation=observation, randomisation=spread))
         assert env.payload_max_kg == pytest.approx(expected_kg)
 
 
-def test_a_payload_is_observed_as_it_is_from_start_to_end(spec, quick_compiler):
-    short_arm = spec.replace(structure={"n_sections": 1, "links_per_section": 2})
-    env = ReachEnv(
-        short_arm, EnvConfig(engine="chain", n_poses=64, observation="payload", randomisation=SPREAD)
-    )
+def test_a_payload_is_observed_as_it_is_from_start_to_end(quick_compiler):
+    config = EnvConfig(engine="chain", n_poses=64, observation="payload", randomisation=SPREAD)
+    env = ReachEnv(SHORT, config)
     start = xla.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
     actions = jax.random.uniform(jax.random.key(1), (64, env.action_size), minval=-1.0)
     after = xla.jit(jax.vmap(env.step))(start, actions)
@@ -102,11 +90,9 @@ def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spri
 
 def test_numbers_of_regulators_fill_their_bounds(spec):
     numbers = {"lag_s": 0.5, "dead_time_s": 0.2, "fill_kpa_per_s": 50.0, "vent_kpa_per_s": 20.0}
-    spec = spec.replace(actuators={"kind": "regulator", "deadband_kpa": 0.2, **numbers})
-    spread = Randomisation(regulator_spread=0.1)
-    episode = EpisodeMotion(spec, EnvConfig(mode="dynamic", randomisation=spread))
-    for share, factor in ((None, 1.0), (0.0, 0.9), (1.0, 1.1)):
-        own = episode.params(share if share is None else jnp.full(6, share))
+    actuators = spec.replace(actuators={"kind": "regulator", "deadband_kpa": 0.2, **numbers}).actuators
+    for share, factor in ((nominal_share(actuators), 1.0), (jnp.zeros(6), 0.9), (jnp.ones(6), 1.1)):
+        own = motion_params(actuators, Randomisation(regulator_spread=0.1), share)
         drawn = {name: getattr(own.actuators, name) for name in numbers} | {"dead_time_s": own.delay_s}
         for name, value in numbers.items():
             np.testing.assert_allclose(drawn[name], factor * value, rtol=1e-6)

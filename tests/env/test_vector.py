@@ -50,57 +50,51 @@ class ObedientEnv:
 def play(*script):
     """Each arm acts by its column of the script; returns the start and what each step returned."""
     arms = VectorEnv(ObedientEnv(), len(script[0]), EPISODE_LENGTH)
+    step = jax.jit(arms.step)
     start = state = arms.reset(jax.random.key(0))
     history = []
     for index, row in enumerate(script):
-        state, after, outcome = arms.step(state, jnp.array(row)[:, None], jax.random.key(index + 1))
-        history.append((state, after, outcome))
+        history.append(step(state, jnp.array(row)[:, None], jax.random.key(index + 1)))
+        state = history[-1][0]
     return start, history
 
 
 def test_an_arm_that_goes_on_is_not_touched():
-    start, [(state, after, outcome)] = play([GO_ON] * 3)
+    start, [(state, after, terminated, truncated)] = play([GO_ON] * 3)
     np.testing.assert_array_equal(state.obs, np.stack([start.obs[:, 0], np.ones(3)], axis=1))
-    np.testing.assert_array_equal(outcome.final_obs, state.obs)
     assert jax.tree.all(jax.tree.map(np.array_equal, state, after))
-    for flag in (outcome.terminated, outcome.truncated, ~outcome.valid):
-        assert not flag.any()
+    assert not terminated.any() and not truncated.any() and after.info["valid"].all()
 
 
 @pytest.mark.parametrize(
-    ("name", "script", "terminated", "truncated", "valid"),
+    ("script", "terminated", "truncated", "valid"),
     [
-        ("reaches at once", [REACH], True, False, True),
-        ("reaches later", [GO_ON, REACH], True, False, True),
-        ("runs out of time", [GO_ON, GO_ON, GO_ON], False, True, True),
-        ("reaches with its last action", [GO_ON, GO_ON, REACH], True, False, True),
-        ("fails", [GO_ON, FAIL], False, False, False),
-        ("fails with its last action", [GO_ON, GO_ON, FAIL], False, False, False),
+        pytest.param([REACH], True, False, True, id="reaches at once"),
+        pytest.param([GO_ON, REACH], True, False, True, id="reaches later"),
+        pytest.param([GO_ON, GO_ON, GO_ON], False, True, True, id="runs out of time"),
+        pytest.param([GO_ON, GO_ON, REACH], True, False, True, id="reaches with its last action"),
+        pytest.param([GO_ON, FAIL], False, False, False, id="fails"),
+        pytest.param([GO_ON, GO_ON, FAIL], False, False, False, id="fails with its last action"),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_an_episode_ends_in_one_way_and_the_next_one_begins(name, script, terminated, truncated, valid):
+def test_an_episode_ends_in_one_way_and_the_next_one_begins(script, terminated, truncated, valid):
     # The arm beside it only goes on, and has as long an episode as there is.
     start, history = play(*[[action, GO_ON] for action in script])
-    state, after, outcome = history[-1]
-    ended = bool(outcome.terminated[0]), bool(outcome.truncated[0]), bool(outcome.valid[0])
-    assert ended == (terminated, truncated, valid)
+    state, after, *ends = history[-1]
+    assert [bool(end[0]) for end in (*ends, after.info["valid"])] == [terminated, truncated, valid]
     # What the action led to belongs to the old episode, what follows to a new one without a step.
-    n_steps = len(script) - (not valid)
-    np.testing.assert_array_equal(outcome.final_obs[0], [start.obs[0, 0], n_steps])
-    np.testing.assert_array_equal(after.obs[0], outcome.final_obs[0])
+    np.testing.assert_array_equal(after.obs[0], [start.obs[0, 0], len(script) - (not valid)])
     assert state.obs[0, 0] != start.obs[0, 0] and state.obs[0, 1] == 0
     assert state.pipeline_state.n_steps[0] == 0 and state.done[0] == 0 and state.info["valid"][0]
-    assert outcome.reward[0] == 10.0 * script[-1]
+    assert after.reward[0] == 10.0 * script[-1]
     assert state.metrics["unsettled"][0] == (not valid)  # counted, though the arm is a new one
-    for _, _, before in history[:-1]:
-        assert not before.terminated[0] and not before.truncated[0] and before.valid[0]
-    assert bool(outcome.truncated[1]) is (len(script) == EPISODE_LENGTH)
-    assert not outcome.terminated[1] and outcome.valid[1]
+    for _, before, *ends in history[:-1]:
+        assert not np.array(ends)[:, 0].any() and before.info["valid"][0]
+    assert [bool(end[1]) for end in history[-1][2:]] == [False, len(script) == EPISODE_LENGTH]
 
 
 def test_a_new_episode_has_its_full_length():
     _, history = play([REACH, GO_ON], *[[GO_ON, GO_ON]] * 5)
-    truncated = np.array([outcome.truncated for _, _, outcome in history])
+    truncated = np.array([step[-1] for step in history])
     np.testing.assert_array_equal(np.flatnonzero(truncated[:, 0]), [3])  # one step later than
     np.testing.assert_array_equal(np.flatnonzero(truncated[:, 1]), [2, 5])

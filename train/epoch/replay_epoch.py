@@ -172,17 +172,17 @@ class ReplayEpoch:
         action = jnp.where(warmed_up, explored, uniform)  # (n_arms, n_springs)
 
         # Step the arms; where an episode ended, begin the next one.
-        arms, after, outcome = self.arms.step(state.arms, action, key_reset)
+        arms, after, terminated, truncated = self.arms.step(state.arms, action, key_reset)
         arms = self._begin(state.goals, arms, key_goals)
 
         # Store what is valid and finite.
         experience = self._experience(state.arms, action, after)
-        valid = outcome.valid & replay.finite_rows(experience)  # (n_arms,)
+        valid = after.info["valid"] & replay.finite_rows(experience)  # (n_arms,)
         memory = replay.add(state.memory, experience, valid)
 
         # Learn.
         learner, losses = self._learn(state.learner, memory, key_updates, warmed_up)
-        ended = outcome.terminated | outcome.truncated
+        ended = terminated | truncated
         of_arms = after.metrics | {"episodes": ended, "successes": ended & (after.metrics["reached"] > 0)}
         env_metrics = {f"env/{name}": jnp.mean(value) for name, value in of_arms.items()}
         state = state._replace(arms=arms, learner=learner, memory=memory, key=key)

@@ -19,7 +19,7 @@ from jax import Array
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
-from mjx_softarm.env.state import EpisodeMotion, State
+from mjx_softarm.env.state import State
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.excitation import circle_poses
@@ -177,7 +177,6 @@ def nominal(env: ReachEnv) -> ReachEnv:
     engine = env.config.engine if env.config.in_motion else "chain"
     config = dataclasses.replace(env.config, engine=engine)
     other.config = dataclasses.replace(config, randomisation=Randomisation(payload_max_kg=0.0))
-    other.episode_motion = EpisodeMotion(env.spec, other.config)
     return other
 
 
