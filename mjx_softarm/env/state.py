@@ -73,7 +73,7 @@ class EpisodeMotion:
         spread = 1.0 + self._spread.regulator_spread * self._regulated
         longest_s = spread * float(np.max(actuators.delay_s)) + self._spread.delay_max_s
         self.n_earlier = n_earlier(longest_s, 1.0 / spec.control.rate_hz) if config.in_motion else 0
-        self._offset_kpa = self._actuators.rest_offset_kpa if config.in_motion else None
+        self._offset_kpa = self._actuators.rest_offset_kpa if config.in_motion else 0.0
 
     def params(self, share: Array | None) -> MotionParams:
         """Return the parameters of an episode.

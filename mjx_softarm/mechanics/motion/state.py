@@ -50,18 +50,15 @@ class Motion(NamedTuple):
         pressure_kpa: Array,
         spring_m: Array,
         n_earlier: int = 0,
-        offset_kpa: Array | float | None = None,
+        offset_kpa: Array | float = 0.0,
     ) -> Motion:
-        """Return the state of an arm at rest.
+        """Return the state of an arm at rest at q (nv,), pressures (n_chambers,) and lengths (n_springs,).
 
         Args:
-            q (nv,): joint coordinates.
-            pressure_kpa (n_chambers,): pressures in the chambers.
-            spring_m (n_springs,): spring lengths.
             n_earlier: number of commands before the last one.
-            offset_kpa (n_chambers,): pressures at rest less their commands; None for none.
+            offset_kpa () or (n_chambers,): pressures at rest less their commands.
         """
-        command = pressure_kpa if offset_kpa is None else pressure_kpa - offset_kpa
+        command = pressure_kpa - offset_kpa
         earlier = jnp.tile(command, (n_earlier, 1)) if n_earlier else None
         law = control.LawState.at_rest(command, spring_m)
         return cls(q, jnp.zeros_like(q), law, pressure_kpa, command, earlier)
