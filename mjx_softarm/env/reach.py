@@ -147,7 +147,7 @@ class ReachEnv(brax_envs.Env):
         self.pipe = self.config.pipe
         if self.pipe is not None and not hangs(self.spec):
             raise InputError(
-                f"pipe_diameter_mm: got {1e3 * self.pipe.diameter_m:g} for the arm {self.spec.name!r}, whose "
+                f"pipe_diameter_mm: got {self.pipe.diameter_mm:g} for the arm {self.spec.name!r}, whose "
                 f"base is turned by {self.spec.mounting.base_turn_deg} deg, expected an arm that hangs: "
                 "pipes are entered from above"
             )

@@ -7,7 +7,8 @@ import numpy as np
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.mechanics.kinematics import ChainKinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from tests.arms import SHORT
 
@@ -39,6 +40,6 @@ def test_in_motion_the_clearance_is_the_least_of_the_way(quick_compiler):
 
 def plain_clearance_m(q):
     """The distance of the bodies of arms (n, nv) to the wall, from kinematics in closed form."""
-    frames = jax.vmap(ChainKinematics(SHORT.link_length_m))(q)
+    frames = jax.vmap(chain_kinematics(ArmParams.from_spec(SHORT)))(q)
     plates = frames.plate_position, frames.plate_rotation
-    return body_clearance(CrossPipe.of_mm(300.0), *plates, SHORT)
+    return body_clearance(CrossPipe(300.0), *plates, SHORT)

@@ -31,7 +31,8 @@ def loaded(payload_kg):
 @jax.jit
 @functools.partial(jax.vmap, in_axes=(0, 0, None))
 def curvature(q, pressure, params):
-    hessian = statics(chain_kinematics(params)(q), q, pressure, params).hessian.dense()
+    found = statics(chain_kinematics(params)(q), q, pressure, params)
+    hessian = jax.vmap(found.hessian.times)(jnp.eye(len(q)))
     root = jnp.sqrt(params.joint_stiffness)
     return jnp.linalg.eigvalsh(hessian / root / root[:, None])[0]
 

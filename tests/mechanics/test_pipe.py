@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from mjx_softarm.mechanics.body import ring_radius_m
-from mjx_softarm.mechanics.kinematics import ChainKinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import RIM_POINTS, CrossPipe, body_clearance, body_points, clearance
 
-PIPE = CrossPipe.of_mm(300.0)
+PIPE = CrossPipe(300.0)
 R, Z = 0.15, -0.55
 
 
@@ -71,7 +72,7 @@ def test_body_of_a_straight_arm(spec):
 def frames(spec):
     """Bent arms (50,), in JAX."""
     q = jnp.array(np.random.default_rng(1).normal(0.0, 0.03, (50, 3 * spec.n_links)), jnp.float32)
-    return jax.vmap(ChainKinematics(spec.link_length_m))(q)
+    return jax.vmap(chain_kinematics(ArmParams.from_spec(spec)))(q)
 
 
 def test_numpy_and_jax_agree(spec, frames):
@@ -100,5 +101,5 @@ def test_gradient_of_the_body(spec, aside_m):
 
 @pytest.mark.parametrize("diameter_mm", [0.0, -300.0, 480.0, np.nan])
 def test_impossible_diameter_is_refused(diameter_mm):
-    with pytest.raises(ValueError, match=r"diameter_m: got .*, expected more than 0 and less than 0\.48"):
-        CrossPipe.of_mm(diameter_mm)
+    with pytest.raises(ValueError, match="diameter_mm: got .*, expected more than 0 and less than 480"):
+        CrossPipe(diameter_mm)

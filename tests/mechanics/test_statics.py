@@ -3,12 +3,13 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.mechanics.kinematics import ChainKinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
@@ -56,8 +57,8 @@ def random_state(spec, seed, bend_rad=0.5):
 
 @jax.jit
 def _statics(q, pressure_kpa, params):
-    found = statics(ChainKinematics(params.link_length_m)(q), q, pressure_kpa, params)
-    return found, found.hessian.dense()
+    found = statics(chain_kinematics(params)(q), q, pressure_kpa, params)
+    return found, jax.vmap(found.hessian.times)(jnp.eye(len(q), dtype=q.dtype))
 
 
 def solved(spec, q, pressure_kpa, dtype=np.float64):
