@@ -15,8 +15,8 @@ def test_straight_arm():
     parts = shape(SPEC, np.full(N, 0.15), UNKNOWN)
     np.testing.assert_allclose(parts.rings.position_m[:, 2], -0.45 * np.arange(1, 13) / 12, atol=1e-12)
     np.testing.assert_allclose(parts.rings.quaternion[:, 0], 1.0, atol=1e-12)
-    np.testing.assert_allclose(parts.folds.pitch_m, 0.15 / FOLDS)
-    np.testing.assert_allclose(parts.coils.pitch_m, 0.15 / COILS)
+    np.testing.assert_allclose(parts.folds.scale[:, 2], 0.15 / FOLDS)
+    np.testing.assert_allclose(parts.coils.scale[:, 2], 0.15 / COILS)
     first = parts.folds.position_m[0]  # of chamber 0, on +y
     np.testing.assert_allclose(first, [0.0, SPEC.geometry.chamber_radius_m, -0.15 * 0.5 / FOLDS], atol=1e-12)
     radius_m = np.hypot(*parts.coils.position_m[:, :2].T)

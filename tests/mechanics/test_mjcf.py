@@ -101,10 +101,9 @@ def renderer(model):
         yield opened
 
 
-@pytest.mark.parametrize("q", [np.zeros(35), np.full(36, np.nan)])
-def test_a_picture_of_nothing_is_refused(renderer, q):
+def test_a_picture_of_nothing_is_refused(renderer):
     with pytest.raises(ValueError, match=r"^q: got"):
-        renderer.draw(q)
+        renderer.draw(np.full(36, np.nan))
 
 
 @pytest.mark.skipif(os.uname().sysname != "Linux", reason="EGL and OSMesa are Linux's")
