@@ -40,16 +40,6 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import Statics, statics
 
 
-class EquilibriumTangents(NamedTuple):
-    """Derivatives of the fields of `Settled` that have these names."""
-
-    q: Array  # (nv,)
-    pressure_kpa: Array  # (n_chambers,)
-    spring_m: Array  # (n_springs,)
-    tip_position_m: Array  # (3,)
-    tip_rotation: Array  # (3, 3)
-
-
 class PressureResponse(NamedTuple):
     """Response of joints and of the law's errors to the chambers' pressures, at the balance of forces."""
 
@@ -72,13 +62,8 @@ class Equilibrium(NamedTuple):
 def gain_columns(potential: Statics, held: Array, params: ArmParams) -> Array:
     """Return forces (n_sections, n, n_springs, *arms) on the joints by references, through the law's gains.
 
-    H^-1 times these forces is `Equilibrium.law_response`. They are zeros for redundant chambers, which are
-    not held.
-
-    Args:
-        potential: at the equilibrium, the gains included.
-        held (n_chambers, *arms): bool, chambers whose gains take part.
-        params: numbers of the arm.
+    H^-1 times these forces is `Equilibrium.law_response`. The gains of the chambers that are `held`,
+    (n_chambers, *arms) bool, take part, and the potential includes them. Redundant chambers are not held.
     """
     n_sections, _, n, *arms = potential.springs.jacobian.shape
     if params.allocation is not None:
@@ -90,14 +75,11 @@ def gain_columns(potential: Statics, held: Array, params: ArmParams) -> Array:
 
 def equilibrium_tangents(
     primals: tuple, tangents: tuple, equilibrium: Equilibrium, settled: Array
-) -> EquilibriumTangents:
-    """Differentiate an equilibrium along a direction.
+) -> dict[str, Array]:
+    """Return the derivatives of an equilibrium along a direction, by the names of the fields of `Settled`.
 
-    Args:
-        primals: params (`ArmParams`) and reference_m (n_springs,) of `settle`.
-        tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
-        equilibrium: the equilibrium.
-        settled () bool: false for a zero derivative.
+    Primals are params and reference_m of `settle`; tangents have their structure, with `SymbolicZero` where
+    nothing changes. An arm that did not settle, () bool, has a zero derivative.
     """
     # Derivatives at fixed joint coordinates and pressures
     params, reference = primals
@@ -138,8 +120,14 @@ def equilibrium_tangents(
     if explicit is not None:
         spring_dot = spring_dot + explicit.spring_m
         tip_dot, rotation_dot = tip_dot + explicit.tip_position_m, rotation_dot + explicit.tip_rotation
-    result = EquilibriumTangents(dq, dp, spring_dot, tip_dot, rotation_dot)
-    return EquilibriumTangents(*(_masked(x, settled) for x in result))
+    tangents_of = {
+        "q": dq,
+        "pressure_kpa": dp,
+        "spring_m": spring_dot,
+        "tip_position_m": tip_dot,
+        "tip_rotation": rotation_dot,
+    }
+    return {name: _masked(x, settled) for name, x in tangents_of.items()}
 
 
 class _Explicit(NamedTuple):

@@ -27,13 +27,8 @@ from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, Settled, SettleResu
 def measured(model: mjx.Model, data: mjx.Data, params: ArmParams, proposed: Settled) -> Settled:
     """Return an equilibrium as MJX measures it: tip, spring lengths, residual and result.
 
-    An arm that did not settle keeps its result.
-
-    Args:
-        model: compiled arm on the device, from `mjx_softarm.mechanics.mjcf`; its actuators take any pressure.
-        data: MJX's data of the model at rest.
-        params: numbers of the arm, whose masses and stiffnesses take the place of the model's.
-        proposed: equilibrium of one arm.
+    An arm that did not settle keeps its result. The model's actuators take any pressure. Masses and
+    stiffnesses of `params` take the place of the model's; `data` are those of the model at rest.
     """
     model = episode_model(model, params)
     data = data.replace(qpos=proposed.q, ctrl=proposed.pressure_kpa)

@@ -116,7 +116,7 @@ def _settle_jvp(n_at_once: int | None, primals: tuple, tangents: tuple) -> tuple
     with jax.default_matmul_precision("highest"):
         tangent = equilibrium_tangents(primals, tangents, equilibrium, settled.settled)
     none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in settled))
-    return settled, none._replace(**tangent._asdict())
+    return settled, none._replace(**tangent)
 
 
 settle.defjvp(_settle_jvp, symbolic_zeros=True)
@@ -275,20 +275,11 @@ def _newton_pass(
 
 
 def _newton_step(
-    iterate: Iterate,
-    potential: Statics,
-    solved: Array,
-    params: ArmParams,
-    reference_m: Array,
+    iterate: Iterate, potential: Statics, solved: Array, params: ArmParams, reference_m: Array
 ) -> Iterate:
     """Return the iterate after a step in joint coordinates and pressures together: H dq = B dp - grad V.
 
-    Args:
-        iterate: start of the step.
-        potential: forces and springs at the iterate.
-        solved (n_sections, n, 1 + n_chambers, *arms): H^-1 [-grad V, B].
-        params: numbers of the arm.
-        reference_m (n_springs, *arms): spring lengths that the law tracks.
+    `solved` (n_sections, n, 1 + n_chambers, *arms) is H^-1 [-grad V, B].
     """
     # Active set: chambers that leave the limits are held there
     error = _law_errors(reference_m - potential.springs.length, iterate.pressure, params.allocation)
@@ -298,10 +289,12 @@ def _newton_step(
 
     # Pressures: each chamber closes its error or goes to its limit
     newton_step, dq_dp = solved[:, :, 0], solved[:, :, 1:]
-    spring_response = products(potential.springs.jacobian, solved).reshape(
-        len(reference_m), -1, *error.shape[1:]
-    )
-    closed, closed_per_kpa = _closed_errors(spring_response[:, 0], spring_response[:, 1:], params.allocation)
+    closing = products(potential.springs.jacobian, solved)  # by the step at constant pressures, and per kPa
+    closing = closing.reshape(len(reference_m), -1, *error.shape[1:])
+    closed, closed_per_kpa = closing[:, 0], closing[:, 1:]
+    if params.allocation is not None:
+        closing = product(params.allocation.chamber_error, closing)
+        closed, closed_per_kpa = closing[:, 0], closing[:, 1:] + YIELD_M_PER_KPA * params.allocation.redundant
     rows = jnp.where(at_limit[:, None], identity(len(error), closed_per_kpa), closed_per_kpa)
     residual = jax.lax.select(at_limit, limit - iterate.pressure, error - closed)
     dp = eliminate(rows, residual[:, None])[:, 0]
@@ -330,34 +323,11 @@ def _newton_step(
 
 
 def _law_errors(spring_error_m: Array, pressure_kpa: Array, allocation: Allocation | None) -> Array:
-    """Return the error e of each chamber (n_chambers, *arms) [m].
+    """Return the error e of each chamber (n_chambers, *arms) [m], as `control.allocated_error` for one arm.
 
-    Args:
-        spring_error_m (n_springs, *arms) [m]: references less lengths of the springs.
-        pressure_kpa (n_chambers, *arms) [kPa]: pressures.
-        allocation: matrices (..., *arms) of an arm with redundant chambers.
+    `spring_error_m` (n_springs, *arms) [m] are references less lengths of the springs.
     """
     if allocation is None:
         return spring_error_m
     of_springs = product(allocation.chamber_error, spring_error_m[:, None])[:, 0]
     return of_springs - YIELD_M_PER_KPA * product(allocation.redundant, pressure_kpa[:, None])[:, 0]
-
-
-def _closed_errors(
-    newton_spring_m: Array, spring_per_kpa: Array, allocation: Allocation | None
-) -> tuple[Array, Array]:
-    """Return by how much a Newton step, and each pressure, lessens the error of each chamber.
-
-    Args:
-        newton_spring_m (n_springs, *arms) [m]: lengthening of the springs by the step at constant pressures.
-        spring_per_kpa (n_springs, n_chambers, *arms) [m/kPa]: response of the springs to the pressures.
-        allocation: matrices (..., *arms) of an arm with redundant chambers.
-
-    Returns:
-        (n_chambers, *arms) [m] and (n_chambers, n_chambers, *arms) [m/kPa].
-    """
-    if allocation is None:
-        return newton_spring_m, spring_per_kpa
-    newton = product(allocation.chamber_error, newton_spring_m[:, None])[:, 0]
-    per_kpa = product(allocation.chamber_error, spring_per_kpa)
-    return newton, per_kpa + YIELD_M_PER_KPA * allocation.redundant

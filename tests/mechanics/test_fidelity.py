@@ -1,4 +1,4 @@
-"""Settled arm, stepped MJX and stepped C MuJoCo come to the same rest under the sensor-space law.
+"""Settled arm and stepped C MuJoCo come to the same rest under the sensor-space law.
 
 The truth is C MuJoCo with the law in the loop, stepped until nothing moves. A rest depends on neither the
 time step nor the damping nor the law's gains, so the truth is taken with those that come to rest soonest, and
@@ -9,18 +9,16 @@ import functools
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
-from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
-from tests.arms import OTHER_ARMS, SHORT
+from tests.arms import OTHER_ARMS
 
 SPEC = ArmSpec.default()
 GAINS = control.Gains.from_spec(SPEC)
@@ -122,46 +120,6 @@ def test_neither_time_step_nor_damping_nor_gains_move_the_rest():
         np.testing.assert_allclose(own.q, fast.q[k], atol=1e-5)
         np.testing.assert_allclose(own.tip_position_m, fast.tip_position_m[k], atol=2e-6)
         np.testing.assert_allclose(own.pressure_kpa, fast.pressure_kpa[k], atol=1e-2)
-
-
-def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
-    model = mjx.put_model(fast_model(SHORT))
-    n_ticks = 300
-
-    def rest_of(reference):
-        def tick(carry, _):
-            data, law = carry
-            pressure, law = control.pressures(
-                reference, spring_lengths(data, model.nu, model.nu), law, FAST_GAINS, FAST_STEP_S
-            )
-            return (mjx.step(model, data.replace(ctrl=pressure)), law), None
-
-        straight_m = jnp.full(model.ntendon, SPEC.geometry.section_length_m)
-        start = mjx.make_data(model).replace(ten_length=straight_m)
-        law = control.LawState.at_rest(jnp.zeros(model.nu), spring_lengths(start, model.nu, model.nu))
-        (data, law), _ = jax.lax.scan(tick, (start, law), None, length=n_ticks)
-        return data.qpos, data.qvel, law.integral_kpa
-
-    q, velocity, pressure = xla.jit(jax.vmap(rest_of))(np.float32(references(N, 0, SHORT)))
-    assert np.abs(velocity).max() < 1e-6
-    rest = truth(N, 0, SHORT)
-    found = at_q(q)
-    assert position_error_mm(found, rest).max() < POSITION_MM / 10
-    assert angle_error_deg(found, rest).max() < ANGLE_DEG / 10
-    np.testing.assert_allclose(pressure, rest.pressure_kpa, atol=0.02)
-
-
-def at_q(q):
-    """Tips of joint coordinates, from C MuJoCo; only the tips' fields are filled."""
-    model = build_model(SHORT)
-    data = mujoco.MjData(model)
-    position, rotation = [], []
-    for row in np.asarray(q):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        position.append(data.site("tip").xpos.copy())
-        rotation.append(data.site("tip").xmat.reshape(3, 3).copy())
-    return Rest(None, None, None, np.stack(position), np.stack(rotation), None)
 
 
 @pytest.mark.parametrize(
