@@ -134,26 +134,14 @@ def test_a_limit_is_made_up_for_with_redundant_pressure():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_long_saturation_is_left_at_once(sign):
-    gains = GAINS._replace(reference_s=0.0)
-    unlimited = gains._replace(pressure_min_kpa=-np.inf, pressure_max_kpa=np.inf)
-    limit = HIGH if sign > 0 else LOW
+    gains, limit = GAINS._replace(reference_s=0.0), HIGH if sign > 0 else LOW
     length = np.full(9, FREE_M + M_PER_KPA * limit)  # as far as the limit takes it
-    out_of_reach, back = np.full(9, FREE_M + sign * 0.2), length - sign * 0.005
-    clamped = wound_up = LawState.at_rest(np.zeros(9), length)
+    state = LawState.at_rest(np.zeros(9), length)
     for _ in range(round(30.0 / DT_S)):
-        pressure, clamped = pressures(out_of_reach, length, clamped, gains, DT_S)
-        _, wound_up = pressures(out_of_reach, length, wound_up, unlimited, DT_S)
+        pressure, state = pressures(np.full(9, FREE_M + sign * 0.2), length, state, gains, DT_S)
     np.testing.assert_array_equal(pressure, limit)
-
-    def ticks_at_the_limit(state, gains):
-        for tick in range(100_000):
-            free, state = pressures(back, length, state, gains, DT_S)
-            if (np.clip(free, LOW, HIGH) != limit).all():
-                return tick
-        return None
-
-    assert ticks_at_the_limit(clamped, gains) == 0
-    assert ticks_at_the_limit(wound_up, unlimited) > 1000
+    pressure, _ = pressures(length - sign * 0.005, length, state, gains, DT_S)
+    assert (pressure != limit).all()
 
 
 def test_saturated_needs_the_limit_and_the_error_it_blocks():

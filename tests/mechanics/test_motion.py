@@ -18,9 +18,7 @@ from mjx_softarm.mechanics.motion.state import (
     MotionParams,
     MotionResult,
     MovingArm,
-    in_force,
     n_earlier,
-    pushed,
 )
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.statics import all_tendons, chambers_and_springs
@@ -193,17 +191,17 @@ def test_commands_in_force_are_their_mean_over_the_time_before_the_dead_time():
     """Ten control periods in two intervals each, against a mean over fine steps of time."""
     delay_s, h, fine = np.array([0.0, 0.013, 0.05, 0.0875]), PERIOD_S / 2, 1e-5
     told = np.random.default_rng(0).normal(size=(10, 4))
-    before, earlier = jnp.zeros(4), jnp.zeros((n_earlier(delay_s.max(), PERIOD_S), 4))
+    zeros = jnp.zeros(4)
+    motion = Motion.at_rest(zeros, zeros, zeros, n_earlier(delay_s.max(), PERIOD_S))
     for period, command in enumerate(jnp.float32(told)):
         for k in range(2):
-            line = command, before, earlier
             with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-                got = in_force(*line, k, h, jnp.float32(delay_s), PERIOD_S)
+                got = motion.in_force(command, k, h, jnp.float32(delay_s), PERIOD_S)
             time_s = PERIOD_S * period + h * k + np.arange(0.5 * fine, h, fine)[:, None] - delay_s
             index = np.floor(time_s / PERIOD_S).astype(int)
             by_hand = np.where(index < 0, 0.0, told[np.maximum(index, 0), np.arange(4)]).mean(axis=0)
             np.testing.assert_allclose(got, by_hand, atol=1e-4)
-        before, earlier = command, pushed(earlier, before)
+        motion = motion.commanded(command)
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,6 @@ from mjx_softarm.mechanics.motion.state import (
     MovingArm,
     Path,
     friction_damping,
-    in_force,
-    pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2, ArmParams
 from mjx_softarm.mechanics.statics import (
@@ -162,11 +160,10 @@ def _tick(
     command, law = control.pressures(*law_inputs, dt_s=period_s)
     command, law = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (command, law)) if arms else (command, law)
 
-    earlier = pushed(motion.earlier_kpa, motion.command_kpa)
     motion, arm = motion._replace(law=law), arm._replace(params=params, own=own)
     for k in range(n_steps):
         motion = _step(arm, motion, command, k, period_s / n_steps, period_s)
-    return motion._replace(command_kpa=command, earlier_kpa=earlier), seen
+    return motion.commanded(command), seen
 
 
 def _look(params: ArmParams, q: Array) -> Path:
@@ -211,8 +208,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
 
     def fill(gas_m3: Array, volume: Array, half: int) -> Array:
         """Return the gas (n_chambers, *arms) after a half step, counted from the start of the period."""
-        line = command_kpa, motion.command_kpa, motion.earlier_kpa
-        command = in_force(*line, half, 0.5 * h, arm.own.delay_s, period_s)
+        command = motion.in_force(command_kpa, half, 0.5 * h, arm.own.delay_s, period_s)
         return actuators.fill(gas_m3, volume, command, 0.5 * h)
 
     # Pressures in the middle of the step

@@ -29,15 +29,7 @@ from mjx_softarm import control, pneumatics
 from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.kinematics import frames_of
 from mjx_softarm.mechanics.mjcf import chamber_lengths, episode_model, spring_lengths
-from mjx_softarm.mechanics.motion.state import (
-    Motion,
-    MotionEnd,
-    MovingArm,
-    Path,
-    friction_damping,
-    in_force,
-    pushed,
-)
+from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MovingArm, Path, friction_damping
 
 
 def advance(
@@ -59,23 +51,22 @@ def advance(
         motion, gas_m3 = state
         data, spring_m, _volume = _at(arm, model, motion.q, motion.velocity)
         command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
-        line = command, motion.command_kpa, motion.earlier_kpa
 
         def step(moving: tuple[Array, Array, Array], k: Array) -> tuple[tuple[Array, Array, Array], None]:
             """Fill the chambers by the commands whose dead time is over, then take MJX's own step."""
             q, velocity, gas_m3 = moving
             # `mjx.step` computes the lengths again, and it is not measured whether XLA merges the two
             data, _, volume = _at(arm, model, q, velocity)
-            gas_m3 = own.actuators.fill(gas_m3, volume, in_force(*line, k, h, own.delay_s, period_s), h)
+            in_force_kpa = motion.in_force(command, k, h, own.delay_s, period_s)
+            gas_m3 = own.actuators.fill(gas_m3, volume, in_force_kpa, h)
             data = data.replace(ctrl=pneumatics.pressure_of(gas_m3, volume))
             data = mjx.step(_with_friction(arm, model, data), data)
             return (data.qpos, data.qvel, gas_m3), None
 
         moving = motion.q, motion.velocity, gas_m3
         (q, velocity, gas_m3), _ = jax.lax.scan(step, moving, jnp.arange(n_steps))
-        earlier = pushed(motion.earlier_kpa, motion.command_kpa)
-        motion = motion._replace(q=q, velocity=velocity, law=law, command_kpa=command, earlier_kpa=earlier)
-        return (motion, gas_m3), Path.at(frames_of(model, data), spring_m)
+        end = motion._replace(q=q, velocity=velocity, law=law).commanded(command)
+        return (end, gas_m3), Path.at(frames_of(model, data), spring_m)
 
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         _, _, volume = _at(arm, model, motion.q, motion.velocity)
