@@ -32,17 +32,11 @@ def measured(model: mjx.Model, data: mjx.Data, params: ArmParams, proposed: Sett
     """
     model = episode_model(model, params)
     data = data.replace(qpos=proposed.q, ctrl=proposed.pressure_kpa)
+    # Velocities are zero: so are MJX's velocities of bodies and tendons in fresh data
+    positions = mjx.kinematics, mjx.com_pos, mjx.tendon, mjx.transmission
+    forces = mjx.passive, mjx.rne, mjx.fwd_actuation
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        # Velocities are zero: so are MJX's velocities of bodies and tendons in fresh data
-        for stage in (
-            mjx.kinematics,
-            mjx.com_pos,
-            mjx.tendon,
-            mjx.transmission,
-            mjx.passive,
-            mjx.rne,
-            mjx.fwd_actuation,
-        ):
+        for stage in (*positions, *forces):
             data = stage(model, data)
     residual = jnp.max(jnp.abs(data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias))
     tip_position_m, tip_rotation = tip_of(data)

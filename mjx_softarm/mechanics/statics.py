@@ -62,6 +62,12 @@ class Lines(NamedTuple):
     length: Array  # (n_chambers or n_springs, *arms) [m]
     jacobian: Array  # (n_sections, c or s, n, *arms) by the n joints of a section
 
+    def forces(self, tension: Array) -> Array:
+        """Return each one's force (n_sections, n, c or s of all sections, *arms) on each section's joints."""
+        n_sections, _, n, *arms = self.jacobian.shape
+        pull = self.jacobian * tension.reshape(n_sections, -1, 1, *arms)
+        return block_diagonal(jnp.swapaxes(pull, 1, 2)).reshape(n_sections, n, -1, *arms)
+
 
 class Statics(NamedTuple):
     """Derivatives of the potential at given joint coordinates and pressures."""
@@ -81,9 +87,7 @@ class Statics(NamedTuple):
     @property
     def push_per_kpa(self) -> Array:
         """(n_sections, n, n_chambers, *arms) generalised force of each chamber on each section's joints."""
-        n_sections, _, n, *arms = self.chambers.jacobian.shape
-        push = self.chambers.jacobian * self.area.reshape(n_sections, -1, 1, *arms)
-        return block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, n, -1, *arms)
+        return self.chambers.forces(self.area)
 
 
 @jax.jit  # traced once for all of its callers

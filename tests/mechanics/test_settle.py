@@ -1,7 +1,5 @@
 """The settled arm: forces balance in C MuJoCo, the law is at rest, and what cannot settle says so."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -27,9 +25,7 @@ ONE_SECTION = SPEC.replace(structure={"n_sections": 1})
 N = 128  # arms a batch, always, so that little is compiled
 
 
-@functools.cache
-def solver():
-    return jax.jit(jax.vmap(lambda params, x: settle(params, x), in_axes=(None, 0)))
+solve_many = jax.jit(jax.vmap(lambda params, x: settle(params, x), in_axes=(None, 0)))
 
 
 def settled(solve, target, spec=SPEC, params=None):
@@ -37,7 +33,7 @@ def settled(solve, target, spec=SPEC, params=None):
     with jax.numpy_dtype_promotion("strict"):
         if solve is settle_many:
             return settle_many(spec, target)
-        found = solver()(ArmParams.from_spec(spec) if params is None else params, np.float32(target))
+        found = solve_many(ArmParams.from_spec(spec) if params is None else params, np.float32(target))
     return jax.tree.map(np.asarray, found)
 
 
@@ -230,7 +226,7 @@ def test_many_arms_settle_as_each_does_alone_whatever_numbers_they_share():
 
 def test_new_numbers_need_no_new_compilation():
     settled(settle, references())
-    n_compiled = solver()._cache_size()
+    n_compiled = solve_many._cache_size()
     found = settled(settle, references()[::-1], SPEC.replace(mass={"payload_kg": 0.1}))
     assert found.settled.all()
-    assert solver()._cache_size() == n_compiled
+    assert solve_many._cache_size() == n_compiled

@@ -50,7 +50,7 @@ class Camera:
 
 
 class Renderer:
-    """Renderer of one model. It holds an OpenGL context until it is closed, so a film opens only one."""
+    """Renderer of one model. It holds an OpenGL context while it is entered, so a film opens only one."""
 
     def __init__(self, model: mujoco.MjModel, width: int = 900, height: int = 1200):
         """Open the context for pictures of width x height pixels of a model of `mjx_softarm.mechanics.mjcf`.
@@ -95,15 +95,11 @@ class Renderer:
         _add_light(scene, np.radians(view.azimuth))
         return self._renderer.render()
 
-    def close(self) -> None:
-        """Free the context; the renderer draws no more."""
-        self._renderer.close()
-
     def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self._renderer.close()
 
     def _camera(self, camera: Camera) -> mujoco.MjvCamera:
         view = mujoco.MjvCamera()
