@@ -164,10 +164,8 @@ def at_chambers(error_m: Array, allocation: Allocation | None) -> Array:
 def allocated_error(error_m: Array, pressure_kpa: Array, allocation: Allocation | None) -> Array:
     """Return the error (..., n_chambers) [m] that each chamber closes.
 
-    Args:
-        error_m (..., n_springs) [m]: references less lengths of the springs.
-        pressure_kpa (..., n_chambers) [kPa]: pressures, whose redundant part is an error as well.
-        allocation: matrices of the arm; None: each chamber closes the error of its own spring.
+    Without an allocation it is that of its spring. Errors of the springs (..., n_springs) [m] are references
+    less lengths. The redundant part of the pressures (..., n_chambers) [kPa] is an error as well.
     """
     if allocation is None:
         return error_m

@@ -29,7 +29,10 @@ LONGEST_DELAY_S = 2.0  # longest dead time; the state of an arm in motion holds 
 
 
 def volume_m3(length_m: Array, area_m2: Array, slope_m: Array, rest_m: Array | float) -> Array:
-    """Return volumes (...) [m^3] of chambers with effective areas `area_m2` (...) at the lengths `rest_m`."""
+    """Return volumes (...) [m^3] of chambers; their effective areas are `area_m2` (...) at lengths `rest_m`.
+
+    `slope_m` (...) is d area / d length.
+    """
     return area_m2 * length_m + 0.5 * slope_m * (length_m - rest_m) ** 2
 
 
@@ -74,13 +77,9 @@ class Actuators:
         return gas_m3 * (area_m2 / volume_m3) ** 2
 
     def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
-        """Return the gas (..., n) after a time dt_s.
+        """Return the gas (..., n) [m^3 at atmospheric pressure] after a time dt_s, from that at its start.
 
-        Args:
-            gas_m3 (..., n) [m^3]: gas at the start, as its volume at atmospheric pressure.
-            volume_m3 (..., n) [m^3]: volumes of the chambers, as `felt`.
-            command_kpa (..., n) [kPa]: commands in force; the dead time is over.
-            dt_s: duration.
+        Volumes (..., n) are as `felt`; commands (..., n) are in force, their dead time over.
         """
         raise NotImplementedError
 

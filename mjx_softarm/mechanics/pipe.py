@@ -77,15 +77,10 @@ def _norm(xp, a: Array, b: Array) -> Array:
 
 
 def body_points(plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
-    """Return points on the rims of all rings, then the corners of the gripper.
+    """Return points (..., RIM_POINTS * (L + 1) + 24, 3) [m] on all rims, then the corners of the gripper.
 
-    Args:
-        plate_position (..., L + 1, 3) [m]: from base to tip, as in `mjx_softarm.mechanics.kinematics.Frames`.
-        plate_rotation (..., L + 1, 3, 3): columns are a plate's axes.
-        spec: the arm.
-
-    Returns:
-        (..., RIM_POINTS * (L + 1) + 24, 3) [m], in the frame of the plates.
+    Plates have positions (..., L + 1, 3) [m] and rotations (..., L + 1, 3, 3) from base to tip, as in
+    `mjx_softarm.mechanics.kinematics.Frames`; the points are in their frame.
     """
     xp = array_namespace(plate_position, plate_rotation)
     circle = ring_radius_m(spec)[:, None, None] * rim_points(1.0, RIM_POINTS)  # (L + 1, RIM_POINTS, 3)

@@ -54,9 +54,7 @@ class Motion(NamedTuple):
     ) -> Motion:
         """Return the state of an arm at rest at q (nv,), pressures (n_chambers,) and lengths (n_springs,).
 
-        Args:
-            n_earlier: number of commands before the last one.
-            offset_kpa () or (n_chambers,): pressures at rest less their commands.
+        The offset, () or (n_chambers,), is that of pressures at rest from their commands.
         """
         command = pressure_kpa - offset_kpa
         earlier = jnp.tile(command, (n_earlier, 1)) if n_earlier else None
