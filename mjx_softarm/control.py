@@ -37,6 +37,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
@@ -80,15 +81,13 @@ def chambers_of_springs(spec: ArmSpec) -> np.ndarray:
 
     A chamber's length is that of the plane through its section's springs, at the chamber's own radius.
     """
-    c = spec.structure.chambers_per_section
-    s = spec.springs_per_section
-    blocks = []
+    n_chambers, n_springs = spec.structure.chambers_per_section, spec.springs_per_section
     radii = map(spec.per_section, (spec.geometry.chamber_radius_m, spec.geometry.spring_radius_m))
-    for section, (chamber, spring) in enumerate(zip(*radii, strict=True)):
-        rows = np.zeros((c, spec.n_springs))
-        rows[:, section * s : (section + 1) * s] = planes(c, chamber) @ np.linalg.pinv(planes(s, spring))
-        blocks.append(rows)
-    return np.concatenate(blocks)
+    blocks = (
+        planes(n_chambers, chamber) @ np.linalg.pinv(planes(n_springs, spring))
+        for chamber, spring in zip(*radii, strict=True)
+    )
+    return np.asarray(block_diag(*blocks))
 
 
 class Gains(NamedTuple):
@@ -124,19 +123,14 @@ class LawState(NamedTuple):
 
     @classmethod
     def at_rest(cls, pressure_kpa: Array, length_m: Array) -> LawState:
-        """Return the memory of a law that holds an arm at rest.
-
-        Args:
-            pressure_kpa (..., n_chambers) [kPa]: pressures that it holds.
-            length_m (..., n_springs) [m]: spring lengths at these pressures.
-        """
+        """Return the memory of a law that holds an arm at these pressures and lengths."""
         return cls(pressure_kpa, length_m, length_m)
 
 
 def pressures(
     reference_m: Array, length_m: Array, state: LawState, gains: Gains, dt_s: float
 ) -> tuple[Array, LawState]:
-    """Compute one tick of the law.
+    """Compute one tick of the law: pressures (..., n_chambers) [kPa] within the limits, and the next state.
 
     Args:
         reference_m (..., n_springs) [m]: spring lengths to reach.
@@ -144,9 +138,6 @@ def pressures(
         state: after the last tick.
         gains: numbers of the law.
         dt_s: time since the last tick.
-
-    Returns:
-        Pressures (..., n_chambers) [kPa] within the limits, and the next state.
     """
     # Reference on its way, smoothed length
     xp = array_namespace(reference_m, length_m, *state, *gains[:-1])
@@ -155,10 +146,8 @@ def pressures(
     smooth_m = 0.5 * (state.length_m + length_m)
 
     # Error and rate at each chamber
-    error_m, change_m = on_its_way_m - length_m, smooth_m - state.length_m
-    if gains.allocation is not None:
-        error_m = allocated_error(error_m, state.integral_kpa, gains.allocation)
-        change_m = at_chambers(change_m, gains.allocation)
+    error_m = allocated_error(on_its_way_m - length_m, state.integral_kpa, gains.allocation)
+    change_m = at_chambers(smooth_m - state.length_m, gains.allocation)
 
     # Integral and pressure, within the limits
     integral_kpa = xp.clip(state.integral_kpa + gains.ki_kpa_per_ms * dt_s * error_m, low, high)
@@ -172,14 +161,14 @@ def at_chambers(error_m: Array, allocation: Allocation | None) -> Array:
     return error_m if allocation is None else _times(allocation.chamber_error, error_m)
 
 
-def allocated_error(error_m: Array, pressure_kpa: Array, allocation: Allocation) -> Array:
+def allocated_error(error_m: Array, pressure_kpa: Array, allocation: Allocation | None) -> Array:
     """Return the error (..., n_chambers) [m] that each chamber closes.
 
-    Args:
-        error_m (..., n_springs) [m]: references less lengths of the springs.
-        pressure_kpa (..., n_chambers) [kPa]: pressures, whose redundant part is an error as well.
-        allocation: matrices of the arm.
+    Without an allocation it is that of its spring. Errors of the springs (..., n_springs) [m] are references
+    less lengths. The redundant part of the pressures (..., n_chambers) [kPa] is an error as well.
     """
+    if allocation is None:
+        return error_m
     redundant_kpa = _times(allocation.redundant, pressure_kpa)
     return at_chambers(error_m, allocation) - YIELD_M_PER_KPA * redundant_kpa
 
@@ -196,18 +185,9 @@ def saturated(
     """Return which chambers (..., n_chambers) cannot reach their reference: bool.
 
     A chamber is saturated if it is at its greatest pressure with its spring too short, or at its least
-    pressure with its spring too long, by more than the tolerance.
-
-    Args:
-        pressure_kpa (..., n_chambers) [kPa]: as `pressures` gives them.
-        reference_m (..., n_springs) [m]: spring lengths to reach.
-        length_m (..., n_springs) [m]: spring lengths read.
-        gains: numbers of the law.
-        tolerance_m: greatest error of a spring whose chamber, at a limit, is not saturated.
+    pressure with its spring too long, by more than the tolerance. The arguments are those of `pressures`.
     """
-    error_m = reference_m - length_m
-    if gains.allocation is not None:
-        error_m = allocated_error(error_m, pressure_kpa, gains.allocation)
+    error_m = allocated_error(reference_m - length_m, pressure_kpa, gains.allocation)
     short = (pressure_kpa >= gains.pressure_max_kpa) & (error_m > tolerance_m)
     long = (pressure_kpa <= gains.pressure_min_kpa) & (error_m < -tolerance_m)
     return short | long

@@ -16,9 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,13 +29,9 @@ LONGEST_DELAY_S = 2.0  # longest dead time; the state of an arm in motion holds 
 
 
 def volume_m3(length_m: Array, area_m2: Array, slope_m: Array, rest_m: Array | float) -> Array:
-    """Return volumes (...) of chambers.
+    """Return volumes (...) [m^3] of chambers; their effective areas are `area_m2` (...) at lengths `rest_m`.
 
-    Args:
-        length_m (...) [m]: lengths.
-        area_m2 (...) [m^2]: effective areas at the length `rest_m`.
-        slope_m (...) [m]: d area / d length.
-        rest_m: length at which the areas are given.
+    `slope_m` (...) is d area / d length.
     """
     return area_m2 * length_m + 0.5 * slope_m * (length_m - rest_m) ** 2
 
@@ -67,9 +61,9 @@ class Actuators:
         raise NotImplementedError
 
     @property
-    def rest_offset_kpa(self) -> Array | float | None:
-        """Pressure at rest less its command, () or (n,); None for none."""
-        return None
+    def rest_offset_kpa(self) -> Array | float:
+        """Pressure at rest less its command, () or (n,)."""
+        return 0.0
 
     def felt(self, volume_m3: Array) -> Array:
         """Return volumes (..., n), as gas and pressures depend on volumes (..., n) [m^3] of the chambers."""
@@ -78,22 +72,14 @@ class Actuators:
     def gas_stiffness(self, gas_m3: Array, volume_m3: Array, area_m2: Array) -> Array:
         """Return the stiffness (..., n) of closed chambers by their length, over the atmosphere's pressure.
 
-        Args:
-            gas_m3 (..., n): gas.
-            volume_m3 (..., n) [m^3]: volumes of the chambers.
-            area_m2 (..., n): effective areas, V'; the stiffness has the unit of its square over that of a
-                volume.
+        It has the unit of `area_m2` (..., n), the effective areas V', squared over that of a volume.
         """
         return gas_m3 * (area_m2 / volume_m3) ** 2
 
     def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
-        """Return the gas (..., n) after a time dt_s.
+        """Return the gas (..., n) [m^3 at atmospheric pressure] after a time dt_s, from that at its start.
 
-        Args:
-            gas_m3 (..., n) [m^3]: gas at the start, as its volume at atmospheric pressure.
-            volume_m3 (..., n) [m^3]: volumes of the chambers, as `felt`.
-            command_kpa (..., n) [kPa]: commands in force; the dead time is over.
-            dt_s: duration.
+        Volumes (..., n) are as `felt`; commands (..., n) are in force, their dead time over.
         """
         raise NotImplementedError
 
@@ -175,7 +161,7 @@ class Regulator(Actuators):
         return gas_m3 + volume_m3 * change_kpa / ATMOSPHERE_KPA
 
 
-ACTUATORS: Mapping[str, type[Actuators]] = MappingProxyType({cls.kind: cls for cls in (Pump, Regulator)})
+ACTUATORS: dict[str, type[Actuators]] = {cls.kind: cls for cls in (Pump, Regulator)}
 PAPER_PUMP = Pump(flow_l_per_min=12.0, valve_s=0.010)  # paper; actuators of a file without the table
 
 
@@ -191,15 +177,9 @@ class Pneumatics:
         timestep_s: float,
         actuators: Actuators = PAPER_PUMP,
     ):
-        """Start at atmospheric pressure, all actuators at rest on it.
+        """Start at lengths (n,) and atmospheric pressure, all actuators at rest on it.
 
-        Args:
-            area_m2 (n,) [m^2]: effective areas at the lengths `rest_m`.
-            slope_m (n,) [m]: d area / d length.
-            rest_m (n,) [m], or one number: lengths of the effective areas.
-            length_m (n,) [m]: lengths at the start.
-            timestep_s: duration of a `step`; dead times are rounded to whole steps.
-            actuators: pumps or regulators.
+        The bellows are those of `volume_m3`. Dead times are rounded to whole time steps.
         """
         self._bellows = area_m2, slope_m, rest_m
         self._timestep_s = timestep_s
@@ -213,8 +193,7 @@ class Pneumatics:
         """Be at rest at pressures (n,) [kPa] and lengths (n,) [m], under the commands that hold them."""
         self.pressure_kpa = np.array(pressure_kpa, float)
         self._gas_m3 = gas_at(self.pressure_kpa, self.volume_m3(length_m))
-        offset_kpa = self._actuators.rest_offset_kpa
-        self._commanded_kpa = self.pressure_kpa - (0.0 if offset_kpa is None else offset_kpa)
+        self._commanded_kpa = self.pressure_kpa - self._actuators.rest_offset_kpa
         self._line = np.tile(self._commanded_kpa, (self._wait.max() + 1, 1))  # commands, newest first
 
     def volume_m3(self, length_m: np.ndarray) -> np.ndarray:

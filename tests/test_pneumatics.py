@@ -91,7 +91,7 @@ def test_each_chamber_has_its_own_dead_time():
     np.testing.assert_array_equal(first, np.round(dead_time_s / DT_S))
 
 
-def test_an_arm_s_chambers_have_their_own_areas_and_actuators():
+def test_an_arm_s_chambers_have_their_own_areas():
     areas = tuple(np.linspace(1e-3, 2e-3, 9))
     spec = ArmSpec.default().replace(
         chambers={"area_m2": areas, "area_slope_m": SLOPE_M}, geometry={"section_length_m": (0.2, 0.1, 0.3)}
@@ -100,13 +100,3 @@ def test_an_arm_s_chambers_have_their_own_areas_and_actuators():
     rest_m = np.repeat([0.2, 0.1, 0.3], 3)
     expected = np.array(areas) * length_m + 0.5 * SLOPE_M * (length_m - rest_m) ** 2
     np.testing.assert_allclose(spec.pneumatics(length_m, DT_S).volume_m3(length_m), expected)
-    regulators = {"kind": "regulator", **vars(REGULATOR)}
-    slow, fast = (
-        spec.replace(actuators=regulators).pneumatics(length_m, DT_S),
-        spec.pneumatics(length_m, DT_S),
-    )
-    for chambers in (slow, fast):
-        chambers.command(np.full(9, 10.0))
-        for _ in range(100):
-            chambers.step(length_m)
-    assert (slow.pressure_kpa == 0.0).all() and (fast.pressure_kpa > 3.0).all()  # a dead time of 0.2 s

@@ -6,7 +6,7 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm.mdp.observation import POSE, ObsScale, observe
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.mechanics.body import shape
+from mjx_softarm.mechanics.body import chamber_directions, shape
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.posture import base_rotation, hangs, posture, straight_pose
@@ -64,10 +64,8 @@ def test_a_straight_tip_in_gimbal_lock_is_refused_with_another_turn_of_the_same_
         mounting={"base_turn_deg": other},
         geometry={"first_chamber_deg": SPEC.geometry.first_chamber_deg + more_deg},
     )
-    holes = [
-        ArmParams.from_spec(spec, np.float64).chamber_site_m.reshape(-1, 2),
-        ArmParams.from_spec(SPEC, np.float64).chamber_site_m.reshape(-1, 2),
-    ]
-    arms = zip((spec, turned(turn_deg)), holes, strict=True)
-    in_base = [base_rotation(arm)[:, :2] @ hole.T for arm, hole in arms]
-    np.testing.assert_allclose(in_base[0], in_base[1], atol=1e-6)
+    same, refused = (
+        base_rotation(arm)[:, :2] @ chamber_directions(arm).reshape(-1, 2).T
+        for arm in (spec, turned(turn_deg))
+    )
+    np.testing.assert_allclose(same, refused, atol=1e-6)

@@ -120,7 +120,7 @@ def imitate(folder: Path, env_steps: int | None, name: str, seed: int) -> None:
     case = CASES[name]
     options = ["--preset", PRESETS[case.task], "--seed", seed]
     if pipe := PIPES.get(case.task):
-        options += ["--pipe", f"{1e3 * pipe.diameter_m:g}"]
+        options += ["--pipe", f"{pipe.diameter_mm:g}"]
     if env_steps:
         options += ["--learner.total-env-steps", env_steps]
     options += [f"--{text.removesuffix('=true')}" for text in case.settings]  # a flag has no value

@@ -193,7 +193,7 @@ def imitate(folder: Path, settings: Settings, name: str, twin: int, seed: int) -
     kind = KINDS[name]
     calibration = folder / arm_name(twin) / CALIBRATION
     options = ["--preset", kind.preset, "--seed", seed, "--calibration", calibration]
-    options += ["--pipe", f"{1e3 * PIPES[kind.task].diameter_m:g}"]
+    options += ["--pipe", f"{PIPES[kind.task].diameter_mm:g}"]
     if kind.reward_of:
         options += ["--reward", folder / run_path(kind.reward_of, twin, seed)]
     options += _options([*kind.settings, *settings.imitation])

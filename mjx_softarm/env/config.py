@@ -71,7 +71,7 @@ class EnvConfig:
     @property
     def pipe(self) -> CrossPipe | None:
         """Pipe around the arm, if there is one."""
-        return None if self.pipe_diameter_mm is None else CrossPipe.of_mm(self.pipe_diameter_mm)
+        return None if self.pipe_diameter_mm is None else CrossPipe(self.pipe_diameter_mm)
 
     @property
     def in_motion(self) -> bool:
@@ -118,4 +118,4 @@ class EnvConfig:
         }
         check_settings("EnvConfig", self, required)
         if self.pipe_diameter_mm is not None:
-            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError
+            CrossPipe(self.pipe_diameter_mm)  # raises ValueError

@@ -70,19 +70,13 @@ class Copies(NamedTuple):
 
     position_m: np.ndarray  # (k, 3)
     quaternion: np.ndarray  # (k, 4) w, x, y, z
-    width_m: np.ndarray  # (k,) size of a copy across its own z; the mesh has size 1
-    pitch_m: np.ndarray  # (k,) length of a copy along its own z; the mesh has length 1
-
-    @property
-    def scales(self) -> np.ndarray:
-        """Scales (k, 3) along the axes of the mesh."""
-        return np.stack([self.width_m, self.width_m, self.pitch_m], axis=-1)
+    scale: np.ndarray  # (k, 3) along the axes of the mesh, whose size is 1: width, width, pitch [m]
 
 
 class ArmShape(NamedTuple):
     """Places of all drawn parts. Bellows and springs are ordered as in the model, each from its upper end."""
 
-    rings: Copies  # links_per_section in each section, their radii as widths; the base's is not among them
+    rings: Copies  # links_per_section in each section, their radii as widths, of pitch 1; without the base's
     folds: Copies  # FOLDS in each bellows, its radius as width
     coils: Copies  # COILS in each spring, of width 1
 
@@ -90,12 +84,11 @@ class ArmShape(NamedTuple):
 def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
     """Return the shape of an arm with springs (n_springs,) [m] and its tip at a pose (6,) [mm, deg]."""
     # Frames along the axis of each section, as shares of its length: rings, folds, coils
-    geometry = spec.geometry
-    n_rings = spec.structure.links_per_section
-    steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
-    shares = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
+    geometry, n_rings = spec.geometry, spec.structure.links_per_section
     spring_site_m = holes_m(spring_directions(spec), spec.per_section(geometry.spring_radius_m))
     base = Frame(np.array(spec.mounting.base_offset_m), base_rotation(spec))
+    steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
+    shares = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
     sections = backbone(base, spring_site_m, spring_m, tip, shares)
     rings, folds, coils = (
         Frame(*(part[:, rows] for part in sections))
@@ -105,10 +98,11 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
     # Rings stand on the axis, folds and coils beside it
     centres = rings.position_m.reshape(-1, 3)
     upright = quaternion_from_rotation(rings.rotation.reshape(-1, 3, 3))
+    radius_m = ring_radius_m(spec)[1:]
     chamber_site_m = holes_m(chamber_directions(spec), spec.per_section(geometry.chamber_radius_m))
     bellows_m = 0.5 * np.array(spec.per_section(geometry.chamber_diameter_m))
     return ArmShape(
-        Copies(centres, upright, ring_radius_m(spec)[1:], np.ones(len(centres))),
+        Copies(centres, upright, np.stack([radius_m, radius_m, np.ones(len(centres))], axis=-1)),
         _beside(folds, chamber_site_m, bellows_m),
         _beside(coils, spring_site_m, np.ones(len(bellows_m))),
     )
@@ -122,11 +116,8 @@ def _beside(line: Frame, hole_m: np.ndarray, width_m: np.ndarray) -> Copies:
     aside = np.einsum("skij,shj->shki", line.rotation[..., :2], hole_m)
     position_m = line.position_m[:, None] + aside  # (n_sections, h, k, 3)
     n_holes, n_copies = position_m.shape[1:3]
-    pitch_m = np.linalg.norm(np.diff(position_m, axis=2), axis=-1).mean(axis=-1)
     quaternion = np.repeat(quaternion_from_rotation(line.rotation)[:, None], n_holes, axis=1)
-    return Copies(
-        position_m.reshape(-1, 3),
-        quaternion.reshape(-1, 4),
-        np.repeat(width_m, n_holes * n_copies),
-        np.repeat(pitch_m.ravel(), n_copies),
-    )
+    pitch_m = np.linalg.norm(np.diff(position_m, axis=2), axis=-1).mean(axis=-1)
+    wide_m = np.repeat(width_m, n_holes)
+    scale = np.repeat(np.stack([wide_m, wide_m, pitch_m.ravel()], axis=-1), n_copies, axis=0)
+    return Copies(position_m.reshape(-1, 3), quaternion.reshape(-1, 4), scale)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm._support.small_matrices import block_diagonal, eliminate, identity, product, products
+from mjx_softarm._support.small_matrices import eliminate, identity, product, products
 
 
 class ChainHessian(NamedTuple):
@@ -47,15 +47,6 @@ class ChainHessian(NamedTuple):
         above = jnp.concatenate([self.above, other.above], axis=2)
         below = jnp.concatenate([self.below, times * other.below], axis=2)
         return ChainHessian(self.own + times * other.own, above, below)
-
-    def dense(self) -> Array:
-        """Return the whole matrix (nv, nv) of one arm."""
-        n_sections, n, _ = self.own.shape
-        section = jnp.repeat(jnp.arange(n_sections), n)
-        above, below = (x.reshape(section.size, -1) for x in (self.above, self.below))
-        further_down = section[:, None] < section
-        far = jnp.where(further_down, product(above, below.T), 0)
-        return block_diagonal(self.own) + far + far.T
 
     def times(self, x: Array) -> Array:
         """Return the product with a vector (nv, *arms)."""
@@ -97,10 +88,7 @@ class ChainHessian(NamedTuple):
 
 @jax.custom_vjp
 def solve_approximate_gradient(matrix: ChainHessian, columns: Array) -> Array:
-    """Multiply the inverse of a matrix by columns (n_sections, n, k, *arms), as `ChainHessian.solve`.
-
-    The gradient is approximate: it is by the columns alone, as if the matrix were a constant.
-    """
+    """Return `matrix.solve(columns)`, whose gradient is by the columns alone, as of a constant matrix."""
     return matrix.solve(columns)
 
 

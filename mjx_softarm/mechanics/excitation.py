@@ -19,11 +19,6 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
     It favours the extremes, where the workspace ends. More than three independent chambers seldom push one
     way together. So every second set of such an arm has, in each section, a plane through the pressures of
     three directions; the other sets distinguish the chambers.
-
-    Args:
-        spec: the arm.
-        n_poses: how many sets.
-        seed: seed of the draw, or a generator.
     """
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     rng = np.random.default_rng(seed)

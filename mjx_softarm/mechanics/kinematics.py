@@ -13,7 +13,8 @@ Many arms come last in every shape, (..., *arms): one instruction then serves se
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -23,7 +24,7 @@ from jax import Array
 
 from mjx_softarm._support.lazy import mjx
 from mjx_softarm._support.small_matrices import product, products
-from mjx_softarm.mechanics.params import LEVEL, ArmParams, Mount
+from mjx_softarm.mechanics.params import ArmParams, Mount
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 
 DOFS_PER_LINK = 3
@@ -40,61 +41,48 @@ class Frames(NamedTuple):
     tip_rotation: Array  # (3, 3, *arms)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class ChainKinematics:
-    """Closed form: products of the links' rotations, sums of the links' vectors."""
+def chain_kinematics(params: ArmParams) -> Callable[[Array], Frames]:
+    """Return the closed form of an arm: a function from joint coordinates (nv, *arms) to its frames.
 
-    link_length_m: Array | np.ndarray  # (n_links, *arms) distance of a link's plates at rest
-    mount: Mount = LEVEL
-
-    def __call__(self, q: Array) -> Frames:
-        arms = q.shape[1:]
-
-        def of_arms(x: Array | np.ndarray, *shape: int) -> Array:
-            """Return a number of the mount (*shape, *arms), from one that may be without arms."""
-            x = jnp.asarray(x, q.dtype)
-            if x.ndim == len(shape):
-                x = x.reshape(*shape, *[1] * len(arms))
-            return jnp.broadcast_to(x, (*shape, *arms))
-
-        # Rotations of the plates: each link turns the plate above it
-        slide, first, second = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
-        y_first = np.arange(len(slide)).reshape(-1, *[1] * len(arms)) % 2 == 1
-        base = of_arms(self.mount.base_rotation, 3, 3)
-        local = _rotation(first, second, y_first)  # (L, 3, 3, *arms)
-        chained = jax.lax.associative_scan(products, local)
-        rotation = jax.vmap(product, in_axes=(None, 0))(base, chained)
-        plate_rotation = jnp.concatenate([base[None], rotation])
-
-        # Positions: half a link and the slide to the hinges, half a link on to the next plate
-        parent, child = plate_rotation[:-1], plate_rotation[1:]
-        half = 0.5 * self.link_length_m
-        to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
-        to_plate = to_anchor - half[:, None] * child[:, :, 2]
-        start = of_arms(self.mount.base_position_m, 3)
-        plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
-
-        # Axes of the joints: the second hinge turns with the first
-        x, y, z = jnp.moveaxis(parent, 2, 0)  # (L, 3, *arms) each
-        swapped = y_first[:, None]
-        cos, sin = jnp.cos(first)[:, None], jnp.sin(first)[:, None]
-        axis_2 = cos * jnp.where(swapped, x, y) + jnp.where(swapped, -sin, sin) * z
-        axis = jnp.stack([-z, jnp.where(swapped, y, x), axis_2], axis=1)
-        last = plate_rotation[-1]
-        return Frames(
-            plate_position,
-            plate_rotation,
-            axis,
-            anchor=plate_position[:-1] + to_anchor,
-            tip_position=plate_position[-1] + jnp.sum(last * of_arms(self.mount.tip_offset_m, 3), axis=1),
-            tip_rotation=product(last, of_arms(self.mount.tip_rotation, 3, 3)),
-        )
+    It multiplies the links' rotations and adds the links' vectors.
+    """
+    return functools.partial(_chain_frames, params.link_length_m, params.mount)
 
 
-def chain_kinematics(params: ArmParams) -> ChainKinematics:
-    """Return the closed-form kinematics of an arm."""
-    return ChainKinematics(params.link_length_m, params.mount)
+def _chain_frames(link_length_m: Array, mount: Mount, q: Array) -> Frames:
+    """Return the frames at q (nv, *arms) of a chain whose plates are link_length_m (n_links, *arms) apart."""
+    # Rotations of the plates: each link turns the plate above it
+    arms = q.shape[1:]
+    slide, first, second = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
+    y_first = np.arange(len(slide)).reshape(-1, *[1] * len(arms)) % 2 == 1
+    base = jnp.broadcast_to(mount.base_rotation, (3, 3, *arms))
+    local = _rotation(first, second, y_first)  # (L, 3, 3, *arms)
+    chained = jax.lax.associative_scan(products, local)
+    rotation = jax.vmap(product, in_axes=(None, 0))(base, chained)
+    plate_rotation = jnp.concatenate([base[None], rotation])
+
+    # Positions: half a link and the slide to the hinges, half a link on to the next plate
+    parent, child = plate_rotation[:-1], plate_rotation[1:]
+    half = 0.5 * link_length_m
+    to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
+    to_plate = to_anchor - half[:, None] * child[:, :, 2]
+    start = jnp.broadcast_to(mount.base_position_m, (3, *arms))
+    plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
+
+    # Axes of the joints: the second hinge turns with the first
+    x, y, z = jnp.moveaxis(parent, 2, 0)  # (L, 3, *arms) each
+    swapped = y_first[:, None]
+    cos, sin = jnp.cos(first)[:, None], jnp.sin(first)[:, None]
+    axis_2 = cos * jnp.where(swapped, x, y) + jnp.where(swapped, -sin, sin) * z
+    last = plate_rotation[-1]
+    return Frames(
+        plate_position,
+        plate_rotation,
+        axis=jnp.stack([-z, jnp.where(swapped, y, x), axis_2], axis=1),
+        anchor=plate_position[:-1] + to_anchor,
+        tip_position=plate_position[-1] + jnp.sum(last * mount.tip_offset_m, axis=1),
+        tip_rotation=product(last, jnp.broadcast_to(mount.tip_rotation, (3, 3, *arms))),
+    )
 
 
 def tip_of(data: mjx.Data) -> tuple[Array, Array]:
@@ -115,13 +103,14 @@ def frames_of(model: mjx.Model, data: mjx.Data) -> Frames:
     half = -model.geom_pos[links, 2:]  # (n_links, 1) place of each link's ring; the base's ring comes first
     position = anchor - half * rotation[:, :, 2]
     base = rotation_from_quaternion(model.body_quat[1])
+    tip_position, tip_rotation = tip_of(data)
     return Frames(
         plate_position=jnp.concatenate([model.geom_pos[:1], position]),
         plate_rotation=jnp.concatenate([base[None], rotation]),
         axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
         anchor=anchor,
-        tip_position=tip_of(data)[0],
-        tip_rotation=tip_of(data)[1],
+        tip_position=tip_position,
+        tip_rotation=tip_rotation,
     )
 
 

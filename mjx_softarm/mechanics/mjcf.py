@@ -51,10 +51,8 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     mjspec.visual.global_.offwidth, mjspec.visual.global_.offheight = 1280, 960
     mjspec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     mjspec.visual.headlight.diffuse = [0.55, 0.55, 0.55]
-    sky = mjspec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
-    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
-    sky.rgb1 = [1.0] * 3
-    sky.rgb2 = [0.82, 0.86, 0.9]
+    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT}
+    mjspec.add_texture(name="sky", width=64, height=384, rgb1=[1.0] * 3, rgb2=[0.82, 0.86, 0.9], **sky)
 
     # The chain from the base to the tools, mounted as the specification says, then its tendons
     world = body = mjspec.worldbody
@@ -71,9 +69,8 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
         _add_chamber(mjspec, chamber, params, spec)
     for spring in range(spec.n_springs):
         _add_spring(mjspec, spring, params, spec)
-    if params.bonded_share is not None:
-        for chamber in range(spec.n_chambers):
-            _add_bonds(mjspec, chamber, float(params.bonded_share), params, spec)
+    for chamber in range(spec.n_chambers if spec.chambers.bonded_share else 0):
+        _add_bonds(mjspec, chamber, params, spec)
     return mjspec
 
 
@@ -122,14 +119,11 @@ def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     section = link // per_section
     half = 0.5 * spec.link_length_m[link]
     offset = -half if link == 0 else -half - 0.5 * spec.link_length_m[link - 1]
-    body = parent.add_body(name=f"link{link}", pos=[0.0, 0.0, offset])
     mass = float(params.link_mass_kg[link])
     radius = spec.per_section(spec.geometry.spring_radius_m)[section]
     sideways = mass * (3 * radius**2 + (2 * half) ** 2) / 12
-    body.mass = mass
-    body.ipos = [0.0, 0.0, 0.0]
-    body.explicitinertial = True
-    body.inertia = [sideways, sideways, mass * radius**2 / 2]
+    inertia = [sideways, sideways, mass * radius**2 / 2]
+    body = _add_body(parent, f"link{link}", offset, mass, inertia)
 
     # Joints: a section's backbone is `links_per_section` links in series
     axial = spec.per_section(spec.backbone.axial_damping_ns_per_m)[section]
@@ -139,9 +133,8 @@ def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     bend_y = ("bend_y", mujoco.mjtJoint.mjJNT_HINGE, [0.0, 1.0, 0.0], bending)
     hinges = (bend_y, bend_x) if link % 2 else (bend_x, bend_y)  # the order of `mechanics.kinematics`
     for k, (name, kind, axis, damping) in enumerate((slide, *hinges)):
-        joint = body.add_joint(name=f"{name}{link}", type=kind, axis=axis)
-        joint.stiffness = _polynomial(float(params.joint_stiffness[3 * link + k]))
-        joint.damping = _polynomial(damping * per_section)
+        linear = {"stiffness": params.joint_stiffness[3 * link + k], "damping": damping * per_section}
+        body.add_joint(name=f"{name}{link}", type=kind, axis=axis, **linear)
 
     # Plate: its ring has the holes of two sections where one ends and the next begins
     plate = np.array([0.0, 0.0, -half])
@@ -151,9 +144,10 @@ def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     return body
 
 
-def _polynomial(linear: float) -> list[float]:
-    """Return the polynomial that MuJoCo takes for stiffness or damping; MJX uses its linear term alone."""
-    return [linear, 0.0, 0.0]
+def _add_body(parent, name: str, z_m: float, mass_kg: float, inertia: list[float]):
+    """Add a body at (0, 0, z_m) in the parent's axes, with its centre of mass at its origin."""
+    mass = {"mass": mass_kg, "inertia": inertia, "ipos": [0.0, 0.0, 0.0], "explicitinertial": True}
+    return parent.add_body(name=name, pos=[0.0, 0.0, z_m], **mass)
 
 
 def _add_ring(body, plate: int, position, spec: ArmSpec) -> None:
@@ -174,24 +168,20 @@ def _add_holes(body, plate: int, section: int, position, params: ArmParams) -> N
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
     """Add gripper and payload below the last plate, and the measured tip on it."""
     half = 0.5 * spec.link_length_m[-1]
-    length = spec.mass.gripper_length_m
-    tip = last.add_site(name="tip", size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
-    tip.pos = np.asarray(params.mount.tip_offset_m) - [0.0, 0.0, half]
-    tip.quat = quaternion_from_rotation(params.mount.tip_rotation)
-    for k, name in enumerate(("gripper", "payload")):
-        tool = last.add_body(name=name, pos=[0.0, 0.0, -half - float(params.tool_offset_m[k])])
-        mass = float(params.tool_mass_kg[k])
-        tool.mass = mass
-        tool.ipos = [0.0, 0.0, 0.0]
-        tool.explicitinertial = True
-        tool.inertia = [mass * length**2 / 12] * 3
-        boxes = gripper_boxes(spec).items() if name == "gripper" else ()
-        for box, (size, position) in boxes:
-            drawn = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": _GRIPPER_COLOUR, **_DRAWN_ONLY}
-            tool.add_geom(name=f"gripper_{box}", size=size, pos=position, **drawn)
+    tip_m = np.subtract(params.mount.tip_offset_m, [0.0, 0.0, half])
+    turn = quaternion_from_rotation(params.mount.tip_rotation)
+    last.add_site(name="tip", pos=tip_m, quat=turn, size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
+    tools = zip(("gripper", "payload"), params.tool_offset_m, params.tool_mass_kg, strict=True)
+    gripper, payload = (
+        _add_body(last, name, -half - offset_m, mass, [mass * spec.mass.gripper_length_m**2 / 12] * 3)
+        for name, offset_m, mass in tools
+    )
+    for box, (size, position) in gripper_boxes(spec).items():
+        drawn = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": _GRIPPER_COLOUR, **_DRAWN_ONLY}
+        gripper.add_geom(name=f"gripper_{box}", size=size, pos=position, **drawn)
     if spec.mass.payload_kg > 0:
         size = [payload_radius_m(spec.mass.payload_kg), 0.0, 0.0]
-        tool.add_geom(name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], **_DRAWN_ONLY)
+        payload.add_geom(name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], **_DRAWN_ONLY)
 
 
 def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmSpec) -> None:
@@ -199,54 +189,58 @@ def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: Arm
 
     The actuator's force on the tendon is pressure * (a + b length): MuJoCo's affine gain.
     """
-    section = index // spec.structure.chambers_per_section
-    tendon = _add_tendon(mjspec, f"chamber{index}", section, spec)
-    share = 0.0 if params.bonded_share is None else float(params.bonded_share)
-    tendon.stiffness = _polynomial((1.0 - share) * float(params.chamber_stiffness[index]))
-    tendon.damping = _polynomial(spec.per_chamber(spec.chambers.damping_ns_per_m)[index])
-    tendon.springlength = [float(params.chamber_rest_m[index])] * 2
-    tendon.width = _BELLOWS_DRAWN * spec.per_section(spec.geometry.chamber_diameter_m)[section]
-    tendon.rgba = _SECTION_COLOURS[section % len(_SECTION_COLOURS)]
-
-    # Pressure actuator
-    slope = float(params.area_slope[index])
-    actuator = mjspec.add_actuator(name=f"chamber{index}", target=f"chamber{index}")
-    actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
-    actuator.gaintype = mujoco.mjtGain.mjGAIN_AFFINE
-    actuator.gainprm[:2] = [float(params.area[index]) - slope * params.section_length_m[section], slope]
-    actuator.biastype = mujoco.mjtBias.mjBIAS_NONE
-    actuator.ctrllimited = True
-    actuator.ctrlrange = [float(params.pressure_min_kpa[index]), float(params.pressure_max_kpa[index])]
+    name, section = f"chamber{index}", index // spec.structure.chambers_per_section
+    tendon = mjspec.add_tendon(
+        name=name,
+        stiffness=(1.0 - spec.chambers.bonded_share) * params.chamber_stiffness[index],
+        damping=spec.per_chamber(spec.chambers.damping_ns_per_m)[index],
+        springlength=[params.chamber_rest_m[index]] * 2,
+        width=_BELLOWS_DRAWN * spec.per_section(spec.geometry.chamber_diameter_m)[section],
+        rgba=_SECTION_COLOURS[section % len(_SECTION_COLOURS)],
+    )
+    _wrap_section(tendon, section, spec)
+    slope = params.area_slope[index]
+    mjspec.add_actuator(
+        name=name,
+        target=name,
+        trntype=mujoco.mjtTrn.mjTRN_TENDON,
+        gaintype=mujoco.mjtGain.mjGAIN_AFFINE,
+        gainprm=[params.area[index] - slope * params.section_length_m[section], slope, *[0.0] * 8],
+        biastype=mujoco.mjtBias.mjBIAS_NONE,
+        ctrllimited=True,
+        ctrlrange=[params.pressure_min_kpa[index], params.pressure_max_kpa[index]],
+    )
 
 
 def _add_spring(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmSpec) -> None:
     """Add a spring's tendon."""
     section = index // spec.springs_per_section
-    tendon = _add_tendon(mjspec, f"spring{index}", section, spec)
-    tendon.stiffness = _polynomial(float(params.spring_stiffness[index]))
-    tendon.damping = _polynomial(spec.per_section(spec.springs.damping_ns_per_m)[section])
-    tendon.springlength = [float(params.spring_rest_m[index])] * 2
-    tendon.width = SPRING_WIDTH_M
-    tendon.rgba = _SPRING_COLOUR
+    tendon = mjspec.add_tendon(
+        name=f"spring{index}",
+        stiffness=params.spring_stiffness[index],
+        damping=spec.per_section(spec.springs.damping_ns_per_m)[section],
+        springlength=[params.spring_rest_m[index]] * 2,
+        width=SPRING_WIDTH_M,
+        rgba=_SPRING_COLOUR,
+    )
+    _wrap_section(tendon, section, spec)
 
 
-def _add_bonds(mjspec: mujoco.MjSpec, chamber: int, share: float, params: ArmParams, spec: ArmSpec) -> None:
-    """Add the tendons that a chamber is from ring to ring where it is bonded."""
+def _add_bonds(mjspec: mujoco.MjSpec, chamber: int, params: ArmParams, spec: ArmSpec) -> None:
+    """Add the tendons that a chamber is from ring to ring where it is bonded; its own tendon is drawn."""
     links = spec.structure.links_per_section
+    stiffness = links * spec.chambers.bonded_share * params.chamber_stiffness[chamber]
+    rest_m = params.chamber_rest_m[chamber] / links
     first = chamber // spec.structure.chambers_per_section * links
     for plate in range(first, first + links):
-        bond = mjspec.add_tendon(name=f"bond{chamber}_{plate}")
-        bond.wrap_site(f"chamber{chamber}_plate{plate}")
-        bond.wrap_site(f"chamber{chamber}_plate{plate + 1}")
-        bond.stiffness = _polynomial(float(links * share * params.chamber_stiffness[chamber]))
-        bond.springlength = [float(params.chamber_rest_m[chamber]) / links] * 2
-        bond.rgba = [0.0] * 4  # the chamber's own tendon is drawn
+        bond = {"stiffness": stiffness, "springlength": [rest_m] * 2, "rgba": [0.0] * 4}
+        tendon = mjspec.add_tendon(name=f"bond{chamber}_{plate}", **bond)
+        tendon.wrap_site(f"chamber{chamber}_plate{plate}")
+        tendon.wrap_site(f"chamber{chamber}_plate{plate + 1}")
 
 
-def _add_tendon(mjspec: mujoco.MjSpec, name: str, section: int, spec: ArmSpec) -> mujoco.MjsTendon:
-    """Add a tendon through all rings of a section."""
-    tendon = mjspec.add_tendon(name=name)
-    per_section = spec.structure.links_per_section
-    for plate in range(section * per_section, (section + 1) * per_section + 1):
-        tendon.wrap_site(f"{name}_plate{plate}")
-    return tendon
+def _wrap_section(tendon: mujoco.MjsTendon, section: int, spec: ArmSpec) -> None:
+    """Lead a tendon through its holes in all rings of a section."""
+    links = spec.structure.links_per_section
+    for plate in range(section * links, (section + 1) * links + 1):
+        tendon.wrap_site(f"{tendon.name}_plate{plate}")

@@ -27,27 +27,16 @@ from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, Settled, SettleResu
 def measured(model: mjx.Model, data: mjx.Data, params: ArmParams, proposed: Settled) -> Settled:
     """Return an equilibrium as MJX measures it: tip, spring lengths, residual and result.
 
-    An arm that did not settle keeps its result.
-
-    Args:
-        model: compiled arm on the device, from `mjx_softarm.mechanics.mjcf`; its actuators take any pressure.
-        data: MJX's data of the model at rest.
-        params: numbers of the arm, whose masses and stiffnesses take the place of the model's.
-        proposed: equilibrium of one arm.
+    An arm that did not settle keeps its result. The model's actuators take any pressure. Masses and
+    stiffnesses of `params` take the place of the model's; `data` are those of the model at rest.
     """
     model = episode_model(model, params)
     data = data.replace(qpos=proposed.q, ctrl=proposed.pressure_kpa)
+    # Velocities are zero: so are MJX's velocities of bodies and tendons in fresh data
+    positions = mjx.kinematics, mjx.com_pos, mjx.tendon, mjx.transmission
+    forces = mjx.passive, mjx.rne, mjx.fwd_actuation
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        # Velocities are zero: so are MJX's velocities of bodies and tendons in fresh data
-        for stage in (
-            mjx.kinematics,
-            mjx.com_pos,
-            mjx.tendon,
-            mjx.transmission,
-            mjx.passive,
-            mjx.rne,
-            mjx.fwd_actuation,
-        ):
+        for stage in (*positions, *forces):
             data = stage(model, data)
     residual = jnp.max(jnp.abs(data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias))
     tip_position_m, tip_rotation = tip_of(data)

@@ -12,7 +12,7 @@ from jax import Array
 from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.control import Allocation, allocation
 from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_directions
-from mjx_softarm.pneumatics import Regulator
+from mjx_softarm.pneumatics import Regulator, volume_m3
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
@@ -28,11 +28,6 @@ class Mount(NamedTuple):
     base_rotation: Array | np.ndarray  # (3, 3)
     tip_offset_m: Array | np.ndarray  # (3,) in the axes of the last plate
     tip_rotation: Array | np.ndarray  # (3, 3)
-
-
-LEVEL = Mount(
-    np.zeros(3, np.float32), np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.eye(3, dtype=np.float32)
-)
 
 
 class ArmParams(NamedTuple):
@@ -97,6 +92,11 @@ class ArmParams(NamedTuple):
             spring_rest_m=jnp.where(held, pull / stiffness, self.spring_rest_m),
         )
 
+    def volume_m3(self, length_m: Array) -> Array:
+        """Return the volumes (n_chambers, *arms) [m^3] of chambers with lengths (n_chambers, *arms) [m]."""
+        area = self.area / N_PER_KPA_M2, self.area_slope / N_PER_KPA_M2
+        return volume_m3(length_m, *area, self.free_length_m)
+
     def stiffened(self, factor: Array) -> ArmParams:
         """Return the arm with its chambers' stiffnesses times factors (n_chambers,)."""
         # Rounded as in the published results
@@ -144,8 +144,8 @@ class ArmParams(NamedTuple):
 def _law_stiffness(spec: ArmSpec) -> np.ndarray:
     """Return the forces per length (n_springs,) [N/m] with which the law answers to errors at once.
 
-    A redundant chamber answers to several springs, whose errors need not vanish at rest, and a regulator
-    answers too late to hold an arm: there they are zero.
+    They are zero for redundant chambers, which answer to several springs, whose errors need not vanish at
+    rest, and for regulators, which answer too late to hold an arm.
     """
     redundant = spec.structure.chambers_per_section > LEAST_CHAMBERS
     if redundant or isinstance(spec.actuators, Regulator):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -27,31 +26,25 @@ RIM_POINTS = 16  # points of a ring; its rim is at most 1 - cos(pi / 16) = 1.9 %
 class CrossPipe:
     """Cross-shaped pipe in the base frame; its axes cross at x = y = 0."""
 
-    centre_z_m: ClassVar[float] = -0.55
-    branch_m: ClassVar[float] = 0.3  # from the centre to the outlets left, right and at the bottom
-    top_z_m: ClassVar[float] = 0.0  # the outlet that the arm enters, level with its base
-    reach_m: ClassVar[float] = (
-        0.06  # depth of the containers in a branch; the nominal arm reaches 5 mm further
-    )
-    drop_m: ClassVar[float] = 0.05  # height of a branch's axis over the left and the right container
+    diameter_mm: float
 
-    diameter_m: float
+    # The same in all pipes
+    centre_z_m = -0.55
+    branch_m = 0.3  # from the centre to the outlets left, right and at the bottom
+    top_z_m = 0.0  # the outlet that the arm enters, level with its base
+    reach_m = 0.06  # depth of the containers in a branch; the nominal arm reaches 5 mm further
+    drop_m = 0.05  # height of a branch's axis over the left and the right container
 
     def __post_init__(self) -> None:
         if not 0.0 < self.radius_m < self.branch_m - self.reach_m:
             raise ValueError(
-                f"diameter_m: got {self.diameter_m!r}, expected more than 0 and less than "
-                f"{2 * (self.branch_m - self.reach_m):g}, so that the branches hold their containers"
+                f"diameter_mm: got {self.diameter_mm!r}, expected more than 0 and less than "
+                f"{2e3 * (self.branch_m - self.reach_m):g}, so that the branches hold their containers"
             )
-
-    @classmethod
-    def of_mm(cls, diameter_mm: float) -> CrossPipe:
-        """Return the pipe of this inner diameter."""
-        return cls(1e-3 * diameter_mm)
 
     @property
     def radius_m(self) -> float:
-        return 0.5 * self.diameter_m
+        return 0.5e-3 * self.diameter_mm
 
     def containers(self) -> dict[str, np.ndarray]:
         """Return the finger tips' positions (3,) [m] in the left (-x), right and bottom container."""
@@ -63,22 +56,13 @@ class CrossPipe:
         }
 
 
-PIPES = {
-    "pipe300": CrossPipe.of_mm(300.0),
-    "pipe250": CrossPipe.of_mm(250.0),
-    "pipe200": CrossPipe.of_mm(200.0),
-}
+PIPES = {f"pipe{diameter_mm:g}": CrossPipe(diameter_mm) for diameter_mm in (300.0, 250.0, 200.0)}
 
 
 def clearance(pipe: CrossPipe, position_m: Array) -> Array:
-    """Return the distance to the wall, positive inside; a lower bound near the edge where the pipes meet.
+    """Return the distance (...) [m] to the wall from positions (..., 3) [m], positive inside.
 
-    Args:
-        pipe: the pipe.
-        position_m (..., 3) [m]: in the base frame.
-
-    Returns:
-        (...) [m].
+    Near the edge where the pipes meet, it is a lower bound.
     """
     xp = array_namespace(position_m)
     x, y, z = (position_m[..., k] for k in range(3))
@@ -93,21 +77,23 @@ def _norm(xp, a: Array, b: Array) -> Array:
 
 
 def body_points(plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
-    """Return points on the rims of all rings, then the corners of the gripper.
+    """Return points (..., RIM_POINTS * (L + 1) + 24, 3) [m] on all rims, then the corners of the gripper.
 
-    Args:
-        plate_position (..., L + 1, 3) [m]: from base to tip, as in `mjx_softarm.mechanics.kinematics.Frames`.
-        plate_rotation (..., L + 1, 3, 3): columns are a plate's axes.
-        spec: of the arm.
-
-    Returns:
-        (..., RIM_POINTS * (L + 1) + 24, 3) [m], in the frame of the plates.
+    Plates have positions (..., L + 1, 3) [m] and rotations (..., L + 1, 3, 3) from base to tip, as in
+    `mjx_softarm.mechanics.kinematics.Frames`; the points are in their frame.
     """
     xp = array_namespace(plate_position, plate_rotation)
     circle = ring_radius_m(spec)[:, None, None] * rim_points(1.0, RIM_POINTS)  # (L + 1, RIM_POINTS, 3)
     rims = plate_position[..., None, :] + _turned(plate_rotation, circle)
     corners = plate_position[..., -1:, :] + _turned(plate_rotation[..., -1, :, :], _gripper(spec))
     return xp.concat([rims.reshape(*rims.shape[:-3], -1, 3), corners], axis=-2)
+
+
+def _gripper(spec: ArmSpec) -> np.ndarray:
+    """Return the corners (24, 3) of the gripper's boxes in the last plate's frame."""
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    middle = np.array([0.0, 0.0, -0.5 * spec.mass.gripper_length_m])
+    return np.concatenate([middle + centre + signs * half for half, centre in gripper_boxes(spec).values()])
 
 
 def _turned(rotation: Array, point: np.ndarray) -> Array:
@@ -118,10 +104,3 @@ def _turned(rotation: Array, point: np.ndarray) -> Array:
 def body_clearance(pipe: CrossPipe, plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
     """Return the least `clearance` (...) [m] of the `body_points`."""
     return clearance(pipe, body_points(plate_position, plate_rotation, spec)).min(axis=-1)
-
-
-def _gripper(spec: ArmSpec) -> np.ndarray:
-    """Return the corners (24, 3) of the gripper's boxes in the last plate's frame."""
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    middle = np.array([0.0, 0.0, -0.5 * spec.mass.gripper_length_m])
-    return np.concatenate([middle + centre + signs * half for half, centre in gripper_boxes(spec).values()])

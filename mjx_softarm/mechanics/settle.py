@@ -13,6 +13,27 @@ e = C (reference - s) - YIELD_M_PER_KPA N p, with the matrices C and N of `mjx_s
 An arm that would buckle at constant pressures may stand under the law, whose proportional gain answers to a
 spring's error at once. Where V is not convex, this gain takes part as springs about the references.
 
+**Derivative.** By the implicit function theorem, with the arm's numbers x: as long as the set of chambers at
+a limit stays, these equations differentiate to
+
+    H dq = B dp - d_x grad V,    S dq = dreference - d_x s  or  dp = dlimit,
+
+with H the Hessian of V, B the chambers' push per kPa and S the springs' Jacobian. With K = H^-1 B, and R with
+the rows of S K where chambers track and of the identity where they are at a limit,
+
+    dp = R^-1 r,    dq = K dp - H^-1 d_x grad V,    r = dreference - d_x s + S H^-1 d_x grad V  or  dlimit.
+
+Where the law holds an arm that would buckle at constant pressures, V has the springs l (s - reference)^2 / 2
+of the law's gain l as well, where chambers track. They are at rest, but the joints answer to them at once:
+
+    dq = K dp + H^-1 S^T l (dreference - d_x s) - H^-1 d_x grad V,    with r less S times the last two terms.
+
+Redundant chambers have C S in place of S, C (dreference - d_x s) in place of dreference - d_x s, and
+C S K + YIELD_M_PER_KPA N in place of S K.
+
+This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step; only
+derivatives by the arm's numbers need H^-1.
+
 Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002).
 """
 
@@ -25,13 +46,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.custom_derivatives import zero_from_primal
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.errors import Result
 from mjx_softarm._support.small_matrices import eliminate, identity, product, products
 from mjx_softarm.control import YIELD_M_PER_KPA, Allocation
-from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents, gain_columns
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import Statics, statics
@@ -79,7 +99,41 @@ class Settled(NamedTuple):
         return self.result == SettleResult.CONVERGED.value
 
 
-_Solution = tuple[Settled, Equilibrium]
+class PressureResponse(NamedTuple):
+    """Response of joints and of the law's errors to the chambers' pressures, at the balance of forces."""
+
+    dq_dp: Array  # (nv, n_chambers) [m/kPa, rad/kPa], K
+    closed_per_kpa: Array  # (n_chambers, n_chambers) [m/kPa] decrease of each chamber's error, S K
+
+
+class Evaluation(NamedTuple):
+    """Forces and springs of all arms at an iterate."""
+
+    pressure: Array  # (n_chambers, *arms) [kPa]
+    frames: Frames
+    statics: Statics
+    law_response: Array  # (nv, n_springs, *arms) joints by references, in the last pass; zeros unless held
+
+
+class Iterate(NamedTuple):
+    """Numbers of all arms between two Newton steps."""
+
+    q: Array  # (nv, *arms)
+    pressure: Array  # (n_chambers, *arms) [kPa]
+    at_limit: Array  # (n_chambers, *arms) bool, active set of the last step
+    response: PressureResponse  # at the iterate before the last step
+    n_small: Array  # (*arms,) int, number of small steps in a row with an unchanged active set
+    held: Array  # (*arms,) bool, V has not been convex at some step: the law's gain takes part
+    stiffening: Array  # (*arms,) added joint stiffness as a share of the arm's own, where V is not convex
+    convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
+    iteration: Array  # (*arms,) int
+
+    def goes_on(self, n_small: Array | int) -> Array:
+        """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
+        return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
+
+
+_Solution = tuple[Settled, Evaluation, PressureResponse]
 
 
 def arms_at_once(n_links: int) -> int | None:
@@ -98,8 +152,8 @@ def settle(params: ArmParams, reference_m: Array, n_at_once: int | None = None) 
     """Find the equilibrium under the sensor-space law, starting from the straight arm.
 
     Joint coordinates, pressures, springs and tip are differentiable in all arguments, forward and in reverse,
-    by the implicit function theorem at the final active set (see `mjx_softarm.mechanics.implicit`). The other
-    fields have a zero derivative. An arm that did not settle has a zero derivative in every field.
+    by the implicit function theorem at the final active set. The other fields have a zero derivative, and all
+    fields of an arm that did not settle.
 
     Args:
         params: numbers of the arm.
@@ -112,11 +166,9 @@ def settle(params: ArmParams, reference_m: Array, n_at_once: int | None = None) 
 def _settle_jvp(n_at_once: int | None, primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
     # A second small step brings the response, which is that before the last step, up to date
     params, reference_m = primals
-    settled, equilibrium = _solver(2, n_at_once)(reference_m, params)
+    solution = _solver(2, n_at_once)(reference_m, params)
     with jax.default_matmul_precision("highest"):
-        tangent = equilibrium_tangents(primals, tangents, equilibrium, settled.settled)
-    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in settled))
-    return settled, none._replace(**tangent._asdict())
+        return solution[0], _tangents(primals, tangents, *solution)
 
 
 settle.defjvp(_settle_jvp, symbolic_zeros=True)
@@ -174,7 +226,7 @@ def _solve(n_small: int, reference_m: Array, params: ArmParams) -> _Solution:
 
 def _report(iterate: Iterate, evaluation: Evaluation, params: ArmParams, reference_m: Array) -> _Solution:
     """Return the last iterate as an equilibrium, with its errors and its result."""
-    pressure, frames, potential, law_response = evaluation
+    pressure, frames, potential, _ = evaluation
     residual = jnp.max(jnp.abs(potential.gradient), axis=0)
 
     # Errors of the law: at a limit, only an error counts that would take the chamber away from it
@@ -205,36 +257,7 @@ def _report(iterate: Iterate, evaluation: Evaluation, params: ArmParams, referen
         result=result.astype(jnp.int32),
         iterations=iterate.iteration,
     )
-    return settled, Equilibrium(
-        iterate.q, pressure, at_limit, frames, potential, iterate.response, law_response
-    )
-
-
-class Iterate(NamedTuple):
-    """Numbers of all arms between two Newton steps."""
-
-    q: Array  # (nv, *arms)
-    pressure: Array  # (n_chambers, *arms) [kPa]
-    at_limit: Array  # (n_chambers, *arms) bool, active set of the last step
-    response: PressureResponse  # at the iterate before the last step
-    n_small: Array  # (*arms,) int, number of small steps in a row with an unchanged active set
-    held: Array  # (*arms,) bool, V has not been convex at some step: the law's gain takes part
-    stiffening: Array  # (*arms,) added joint stiffness as a share of the arm's own, where V is not convex
-    convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
-    iteration: Array  # (*arms,) int
-
-    def goes_on(self, n_small: Array | int) -> Array:
-        """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
-        return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
-
-
-class Evaluation(NamedTuple):
-    """Forces and springs of all arms at an iterate."""
-
-    pressure: Array  # (n_chambers, *arms) [kPa]
-    frames: Frames
-    statics: Statics
-    law_response: Array  # (nv, n_springs, *arms) that of `Equilibrium`, in the last pass
+    return settled, evaluation, iterate.response
 
 
 @jax.jit  # traced once for the loop, the shapes of its results, and both values of n_small
@@ -261,7 +284,7 @@ def _newton_pass(
     columns = jnp.concatenate(
         [-potential.gradient.reshape(*push.shape[:2], 1, *push.shape[3:]), push], axis=2
     )
-    gains = gain_columns(potential, held, params)
+    gains = _gain_columns(potential, held, params)
     padding = [(0, n - n_gains) for n_gains, n in zip(gains.shape, columns.shape, strict=True)]
     columns = jnp.where(is_last, jnp.pad(gains, padding), columns)
     solved = jax.lax.cond(is_last & ~jnp.any(held), jnp.zeros_like, hessian.solve, columns)
@@ -275,20 +298,11 @@ def _newton_pass(
 
 
 def _newton_step(
-    iterate: Iterate,
-    potential: Statics,
-    solved: Array,
-    params: ArmParams,
-    reference_m: Array,
+    iterate: Iterate, potential: Statics, solved: Array, params: ArmParams, reference_m: Array
 ) -> Iterate:
     """Return the iterate after a step in joint coordinates and pressures together: H dq = B dp - grad V.
 
-    Args:
-        iterate: start of the step.
-        potential: forces and springs at the iterate.
-        solved (n_sections, n, 1 + n_chambers, *arms): H^-1 [-grad V, B].
-        params: numbers of the arm.
-        reference_m (n_springs, *arms): spring lengths that the law tracks.
+    `solved` (n_sections, n, 1 + n_chambers, *arms) is H^-1 [-grad V, B].
     """
     # Active set: chambers that leave the limits are held there
     error = _law_errors(reference_m - potential.springs.length, iterate.pressure, params.allocation)
@@ -298,10 +312,12 @@ def _newton_step(
 
     # Pressures: each chamber closes its error or goes to its limit
     newton_step, dq_dp = solved[:, :, 0], solved[:, :, 1:]
-    spring_response = products(potential.springs.jacobian, solved).reshape(
-        len(reference_m), -1, *error.shape[1:]
-    )
-    closed, closed_per_kpa = _closed_errors(spring_response[:, 0], spring_response[:, 1:], params.allocation)
+    closing = products(potential.springs.jacobian, solved)  # by the step at constant pressures, and per kPa
+    closing = closing.reshape(len(reference_m), -1, *error.shape[1:])
+    closed, closed_per_kpa = closing[:, 0], closing[:, 1:]
+    if params.allocation is not None:
+        closing = product(params.allocation.chamber_error, closing)
+        closed, closed_per_kpa = closing[:, 0], closing[:, 1:] + YIELD_M_PER_KPA * params.allocation.redundant
     rows = jnp.where(at_limit[:, None], identity(len(error), closed_per_kpa), closed_per_kpa)
     residual = jax.lax.select(at_limit, limit - iterate.pressure, error - closed)
     dp = eliminate(rows, residual[:, None])[:, 0]
@@ -330,12 +346,9 @@ def _newton_step(
 
 
 def _law_errors(spring_error_m: Array, pressure_kpa: Array, allocation: Allocation | None) -> Array:
-    """Return the error e of each chamber (n_chambers, *arms) [m].
+    """Return the error e of each chamber (n_chambers, *arms) [m], as `control.allocated_error` for one arm.
 
-    Args:
-        spring_error_m (n_springs, *arms) [m]: references less lengths of the springs.
-        pressure_kpa (n_chambers, *arms) [kPa]: pressures.
-        allocation: matrices (..., *arms) of an arm with redundant chambers.
+    `spring_error_m` (n_springs, *arms) [m] are references less lengths of the springs.
     """
     if allocation is None:
         return spring_error_m
@@ -343,21 +356,135 @@ def _law_errors(spring_error_m: Array, pressure_kpa: Array, allocation: Allocati
     return of_springs - YIELD_M_PER_KPA * product(allocation.redundant, pressure_kpa[:, None])[:, 0]
 
 
-def _closed_errors(
-    newton_spring_m: Array, spring_per_kpa: Array, allocation: Allocation | None
-) -> tuple[Array, Array]:
-    """Return by how much a Newton step, and each pressure, lessens the error of each chamber.
+def _gain_columns(potential: Statics, held: Array, params: ArmParams) -> Array:
+    """Return forces (n_sections, n, n_springs, *arms) on the joints by references, through the law's gains.
 
-    Args:
-        newton_spring_m (n_springs, *arms) [m]: lengthening of the springs by the step at constant pressures.
-        spring_per_kpa (n_springs, n_chambers, *arms) [m/kPa]: response of the springs to the pressures.
-        allocation: matrices (..., *arms) of an arm with redundant chambers.
-
-    Returns:
-        (n_chambers, *arms) [m] and (n_chambers, n_chambers, *arms) [m/kPa].
+    H^-1 times these forces is `Evaluation.law_response`. The gains of the chambers that are `held`,
+    (n_chambers, *arms) bool, take part, and the potential includes them. Redundant chambers are not held.
     """
-    if allocation is None:
-        return newton_spring_m, spring_per_kpa
-    newton = product(allocation.chamber_error, newton_spring_m[:, None])[:, 0]
-    per_kpa = product(allocation.chamber_error, spring_per_kpa)
-    return newton, per_kpa + YIELD_M_PER_KPA * allocation.redundant
+    springs = potential.springs
+    held_stiffness = jnp.zeros_like(springs.length)
+    if params.allocation is None:
+        held_stiffness = jnp.where(held, params.law_stiffness, 0.0)
+    return springs.forces(held_stiffness)
+
+
+def _tangents(
+    primals: tuple, tangents: tuple, settled: Settled, evaluation: Evaluation, response: PressureResponse
+) -> Settled:
+    """Return the derivative of an equilibrium along tangents of params and reference_m.
+
+    Tangents are `SymbolicZero` where nothing changes. An arm that did not settle has a zero derivative.
+    """
+    # Derivatives at fixed joint coordinates and pressures
+    params, reference = primals
+    params_dot, reference_dot = tangents
+    q, pressure_kpa, at_limit, converged = settled.q, settled.pressure_kpa, settled.at_limit, settled.settled
+    _, frames, potential, law_response = evaluation
+    explicit = _explicit_tangents(params, params_dot, q, pressure_kpa)
+
+    # Inverse of the chambers' equations
+    dq_dp = _masked(response.dq_dp, converged)
+    unit = jnp.eye(len(at_limit), dtype=q.dtype)
+    rows = jnp.where(at_limit[:, None], unit, _masked(response.closed_per_kpa, converged))
+    inverse = _masked(eliminate(rows, unit), converged)
+
+    # Right-hand side of each chamber's equation
+    at_high = pressure_kpa >= params.pressure_max_kpa
+    low_dot = _array(params_dot.pressure_min_kpa, params.pressure_min_kpa)
+    high_dot = _array(params_dot.pressure_max_kpa, params.pressure_max_kpa)
+    tracking_dot = _array(reference_dot, reference)
+    if explicit is not None:
+        tracking_dot = tracking_dot - explicit.spring_m
+    # Joints at constant pressures; the law's gain, where it holds the arm, answers to references at once
+    dq_held = jnp.sum(_masked(law_response, converged) * tracking_dot, axis=-1)
+    if explicit is not None:
+        every = jnp.eye(len(q), dtype=q.dtype).reshape(params.n_sections, -1, len(q))
+        compliance = _masked(potential.hessian.solve(every), converged).reshape(len(q), -1)  # H^-1
+        dq_held = dq_held - jnp.sum(compliance * explicit.gradient, axis=-1)
+    tracking_dot = tracking_dot - _along(potential.springs.jacobian, dq_held)
+    if params.allocation is not None:
+        tracking_dot = params.allocation.chamber_error @ tracking_dot
+    limit_dot = jax.lax.select(at_high, high_dot, low_dot)
+    right = jax.lax.select(at_limit, limit_dot, tracking_dot)
+
+    # Pressures and joints, then springs and tip
+    dp = jnp.sum(inverse * right, axis=-1)
+    dq = jnp.sum(dq_dp * dp, axis=-1) + dq_held
+    tip_dot, rotation_dot = _tip_tangents(frames, dq)
+    spring_dot = _along(potential.springs.jacobian, dq)
+    if explicit is not None:
+        spring_dot = spring_dot + explicit.spring_m
+        tip_dot, rotation_dot = tip_dot + explicit.tip_position_m, rotation_dot + explicit.tip_rotation
+    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in settled))
+    return none._replace(
+        q=_masked(dq, converged),
+        pressure_kpa=_masked(dp, converged),
+        spring_m=_masked(spring_dot, converged),
+        tip_position_m=_masked(tip_dot, converged),
+        tip_rotation=_masked(rotation_dot, converged),
+    )
+
+
+class _Explicit(NamedTuple):
+    """Derivatives by the arm's numbers at fixed joint coordinates and pressures."""
+
+    gradient: Array  # (nv,) of V's gradient
+    spring_m: Array  # (n_springs,)
+    tip_position_m: Array  # (3,)
+    tip_rotation: Array  # (3, 3)
+
+
+def _explicit_tangents(
+    params: ArmParams, params_dot: ArmParams, q: Array, pressure_kpa: Array
+) -> _Explicit | None:
+    """Differentiate along the arm's numbers, pressure limits aside; None where none of them changes."""
+    # Numbers that change; all others stay constants of the differentiated function
+    numbers, structure = jax.tree.flatten(_without_limits(params))
+    directions = jax.tree.leaves(_without_limits(params_dot))
+    changing = [k for k, direction in enumerate(directions) if not isinstance(direction, SymbolicZero)]
+    if not changing:
+        return None
+
+    def observables(*values: Array) -> _Explicit:
+        merged = list(numbers)
+        for k, value in zip(changing, values, strict=True):
+            merged[k] = value
+        arm = jax.tree.unflatten(structure, merged)
+        frames = chain_kinematics(arm)(q)
+        potential = statics(frames, q, pressure_kpa, arm)
+        return _Explicit(
+            potential.gradient, potential.springs.length, frames.tip_position, frames.tip_rotation
+        )
+
+    return jax.jvp(observables, [numbers[k] for k in changing], [directions[k] for k in changing])[1]
+
+
+def _without_limits(params: ArmParams) -> ArmParams:
+    """Return parameters without the numbers that V does not contain."""
+    return params._replace(pressure_min_kpa=None, pressure_max_kpa=None, allocation=None)  # type: ignore
+
+
+def _array(tangent: Array | SymbolicZero, primal: Array) -> Array:
+    """Return a tangent, zeros for a symbolic zero."""
+    return jnp.zeros_like(primal) if isinstance(tangent, SymbolicZero) else tangent
+
+
+def _masked(x: Array, converged: Array) -> Array:
+    """Return x, zeros for an arm that did not settle."""
+    return jax.lax.select(converged, x, jnp.zeros_like(x))
+
+
+def _along(jacobian: Array, dq: Array) -> Array:
+    """Multiply the springs' Jacobian (n_sections, s, n) by joint coordinates (nv,): (n_springs,)."""
+    return jnp.sum(jacobian * dq.reshape(jacobian.shape[0], 1, -1), axis=-1).reshape(-1)
+
+
+def _tip_tangents(frames: Frames, dq: Array) -> tuple[Array, Array]:
+    """Return the tip's velocity (3,) and its rotation's derivative (3, 3) for joint velocities (nv,)."""
+    joint = frames.axis * dq.reshape(-1, DOFS_PER_LINK, 1)
+    turn = joint[:, 1] + joint[:, 2]  # (n_links, 3)
+    lever = frames.tip_position - frames.anchor
+    velocity = jnp.sum(joint[:, 0] + jnp.cross(turn, lever), axis=0)
+    rotation = jnp.cross(jnp.sum(turn, axis=0)[:, None], frames.tip_rotation, axis=0)
+    return velocity, rotation

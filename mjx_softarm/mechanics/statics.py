@@ -62,6 +62,12 @@ class Lines(NamedTuple):
     length: Array  # (n_chambers or n_springs, *arms) [m]
     jacobian: Array  # (n_sections, c or s, n, *arms) by the n joints of a section
 
+    def forces(self, tension: Array) -> Array:
+        """Return each one's force (n_sections, n, c or s of all sections, *arms) on each section's joints."""
+        n_sections, _, n, *arms = self.jacobian.shape
+        pull = self.jacobian * tension.reshape(n_sections, -1, 1, *arms)
+        return block_diagonal(jnp.swapaxes(pull, 1, 2)).reshape(n_sections, n, -1, *arms)
+
 
 class Statics(NamedTuple):
     """Derivatives of the potential at given joint coordinates and pressures."""
@@ -81,20 +87,14 @@ class Statics(NamedTuple):
     @property
     def push_per_kpa(self) -> Array:
         """(n_sections, n, n_chambers, *arms) generalised force of each chamber on each section's joints."""
-        n_sections, _, n, *arms = self.chambers.jacobian.shape
-        push = self.chambers.jacobian * self.area.reshape(n_sections, -1, 1, *arms)
-        return block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, n, -1, *arms)
+        return self.chambers.forces(self.area)
 
 
 @jax.jit  # traced once for all of its callers
 def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
-    """Return gradient and Hessian of V(q) at fixed pressures.
+    """Return gradient and Hessian of V(q) at joint coordinates q (nv, *arms) with these frames.
 
-    Args:
-        frames: of `q`.
-        q (nv, *arms): joint coordinates [m, rad, rad].
-        pressure_kpa (n_chambers, *arms): chamber pressures.
-        params: numbers of the arm.
+    The pressures (n_chambers, *arms) [kPa] are fixed.
     """
     return statics_of(all_tendons(frames, params), frames, q, pressure_kpa, params)
 
@@ -176,11 +176,7 @@ def joined(of_chambers: Array, of_springs: Array, n_sections: int) -> Array:
 
 
 def _bending(tension: Array, link_hessian: Array) -> Array:
-    """Sum tensions (n_sections, t, *arms) times second derivatives of the lengths.
-
-    Returns:
-        (n_sections, n, n, *arms).
-    """
+    """Sum tensions (n_sections, t, *arms) times second derivatives of lengths: (n_sections, n, n, *arms)."""
     n_sections, _, *arms = tension.shape
     per_section = link_hessian.shape[3] // n_sections
     per_link = jnp.repeat(jnp.swapaxes(tension, 0, 1), per_section, axis=1)  # (t, n_links, *arms)
@@ -192,9 +188,8 @@ def _bending(tension: Array, link_hessian: Array) -> Array:
 def stretching(slope: Array, jacobian: Array) -> Array:
     """Return sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n, *arms).
 
-    Args:
-        slope (n_sections, t, *arms): derivatives of the tensions by the lengths.
-        jacobian (n_sections, t, n, *arms): derivatives of the lengths by the joints.
+    Slopes (n_sections, t, *arms) are derivatives of the tensions by the lengths, the Jacobian
+    (n_sections, t, n, *arms) those of the lengths by the joints.
     """
     return products(jnp.swapaxes(jacobian, 1, 2), slope[:, :, None] * jacobian)
 
@@ -202,11 +197,8 @@ def stretching(slope: Array, jacobian: Array) -> Array:
 def tendons(frames: Frames, site_m: Array) -> Tendons:
     """Return lengths of tendons through holes in the rings, with derivatives.
 
-    Vectors are lists of three components (t, n_links, *arms): one instruction serves many links.
-
-    Args:
-        frames: plates and joints.
-        site_m (n_sections, t, 2, *arms): x and y of each tendon's hole in every ring of its section.
+    `site_m` (n_sections, t, 2, *arms) are x and y of each tendon's hole in every ring of its section. Vectors
+    are lists of three components (t, n_links, *arms): one instruction serves many links.
     """
     # Segments of the tendons from the upper to the lower ring of each link
     (n_sections, t), n_links, arms = site_m.shape[:2], frames.axis.shape[0], frames.axis.shape[3:]

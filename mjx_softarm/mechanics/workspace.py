@@ -26,83 +26,72 @@ CANDIDATES_PER_EVEN_POSE = 10
 VOXEL_MM = 25.0
 HELD_OUT_SEED = 20_000  # seed of the goals that policies are evaluated on; training uses other seeds
 
-
 Seed = int | tuple[int, ...]
 
 
 class Pool(NamedTuple):
-    """Equilibria of the nominal arm at given pressures, float32."""
+    """Equilibria, float32."""
 
     q: Array  # (n, nv) [m, rad, rad]
     pressure_kpa: Array  # (n, n_chambers)
     spring_m: Array  # (n, n_springs)
     pose: Array  # (n, 6) [mm, deg]
-
-
-class LoadedPool(NamedTuple):
-    """Equilibria of arms with payloads, whose chambers differ a little from the nominal arm's; float32."""
-
-    load_kg: np.ndarray  # (n,) payload
-    q: Array  # (n, nv) [m, rad, rad]
-    pressure_kpa: Array  # (n, n_chambers)
-    spring_m: Array  # (n, n_springs)
-    pose: Array  # (n, 6) [mm, deg]
-
-
-@functools.cache
-def _solver(n_at_once: int | None):
-    """Return the compiled equilibria of arms with the same parameters, pressures (n, n_chambers)."""
-
-    def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
-        return settle_pressures(params, pressure_kpa, n_at_once)
-
-    return xla.jit(jax.vmap(solve, in_axes=(None, 0)))
-
-
-@functools.cache
-def _loaded_solver(n_at_once: int | None, by_law: bool = False):
-    """Return the compiled equilibria of arms that differ in payload, stiffness and area of each chamber.
-
-    They are at given pressures or, by the law, at the spring lengths that these give the arm unloaded.
-    """
-
-    def solve(
-        params: ArmParams, pressure_kpa: Array, load_kg: Array, stiffness: Array, area: Array
-    ) -> Settled:
-        arm = params.stiffened(stiffness)._replace(area=params.area * area)
-        loaded = arm._replace(tool_mass_kg=jnp.asarray(arm.tool_mass_kg).at[PAYLOAD].set(load_kg))
-        if not by_law:
-            return settle_pressures(loaded, pressure_kpa, n_at_once)
-        unloaded = settle_pressures(arm, pressure_kpa, n_at_once)
-        settled = settle(loaded, unloaded.spring_m, n_at_once)
-        return settled._replace(result=jnp.maximum(settled.result, unloaded.result))
-
-    return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)))
+    load_kg: Array | None = None  # (n,) payload; None: that of the specification
 
 
 def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
     """Return equilibria at many pressures (n, n_chambers) [kPa], as NumPy arrays with a leading axis n."""
-    return _in_batches(_solver, spec, pressure_kpa)
+    return _in_batches(settle_pressures, spec, pressure_kpa)
 
 
-def _in_batches(make_solver: Callable, spec: ArmSpec, *columns: np.ndarray) -> Settled:
-    """Return equilibria of rows of columns (n, ...), as NumPy arrays with a leading axis n."""
-    solver = make_solver(arms_at_once(spec.n_links))
+def _in_batches(settle_one: Callable[..., Settled], spec: ArmSpec, *columns: np.ndarray) -> Settled:
+    """Return `settle_one` of rows of columns (n, ...), as NumPy arrays with a leading axis n."""
+    solver = _solver(settle_one, arms_at_once(spec.n_links), len(columns))
     params = ArmParams.from_spec(spec)
     return xla.in_batches(lambda batch: solver(params, *batch), BATCH, columns)
 
 
+@functools.cache
+def _solver(settle_one: Callable[..., Settled], n_at_once: int | None, n_columns: int) -> Callable:
+    """Return `settle_one` compiled for many rows of columns and arms with the same parameters."""
+
+    def solve(params: ArmParams, *row: Array) -> Settled:
+        return settle_one(params, *row, n_at_once=n_at_once)
+
+    return xla.jit(jax.vmap(solve, in_axes=(None, *[0] * n_columns)))
+
+
+def _settle_loaded(
+    params: ArmParams,
+    pressure_kpa: Array,
+    load_kg: Array,
+    stiffness: Array,
+    area: Array,
+    n_at_once: int | None,
+    by_law: bool = False,
+) -> Settled:
+    """Return the equilibrium of an arm with its own payload, and factors of its chambers' stiffness and area.
+
+    It is at given pressures or, by the law, at the spring lengths that these give the arm unloaded.
+    """
+    arm = params.stiffened(stiffness)._replace(area=params.area * area)
+    loaded = arm._replace(tool_mass_kg=jnp.asarray(arm.tool_mass_kg).at[PAYLOAD].set(load_kg))
+    if not by_law:
+        return settle_pressures(loaded, pressure_kpa, n_at_once)
+    unloaded = settle_pressures(arm, pressure_kpa, n_at_once)
+    settled = settle(loaded, unloaded.spring_m, n_at_once)
+    return settled._replace(result=jnp.maximum(settled.result, unloaded.result))
+
+
+_settle_loaded_by_law = functools.partial(_settle_loaded, by_law=True)
+
+
 def sample_workspace(spec: ArmSpec, n: int, seed: Seed) -> Pool:
-    """Draw poses spread over the whole reachable workspace.
+    """Draw n poses spread over the whole reachable workspace.
 
     Pressures follow the arcsine law between their limits, which favours the extremes, where the workspace
     ends. Of twice as many candidates, `n` are drawn with weights that even out the number of tips per voxel
     of 25 mm. Candidates that did not settle are left out.
-
-    Args:
-        spec: the arm.
-        n: number of poses.
-        seed: of the draw; training and evaluation use different ones.
 
     Raises:
         SpecError: the arm settles at fewer than `n` of the candidates.
@@ -112,7 +101,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: Seed) -> Pool:
     return _pool(equilibria, _chosen(spec, equilibria, equilibria.settled, n, rng, replace=False))
 
 
-def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) -> LoadedPool:
+def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) -> Pool:
     """Draw poses as `sample_workspace` does, of arms with payloads and with chambers that deviate.
 
     With a payload, an arm that lies or stands may buckle at constant pressures. Its law holds its springs, so
@@ -122,34 +111,29 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
         spec: the arm; its own payload is replaced.
         load_kg (m,) [kg]: payloads of the candidates; half of these are drawn.
         spread: largest relative deviation of each chamber's stiffness and area.
-        seed: of the draw; training and evaluation use different ones.
+        seed: seed of the draw.
 
     Raises:
         SpecError: the arm settles at fewer than half of the candidates.
     """
     rng = np.random.default_rng(seed)
-    shape = len(load_kg), spec.n_chambers
-    pressure_kpa = random_pressures(spec, shape[0], rng)
-    factors = (rng.uniform(1.0 - spread, 1.0 + spread, shape) for _ in range(2))
-    solver = functools.partial(_loaded_solver, by_law=not hangs(spec))
-    equilibria = _in_batches(solver, spec, pressure_kpa, load_kg, *factors)
-    rows = _chosen(spec, equilibria, equilibria.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
+    pressure_kpa = random_pressures(spec, len(load_kg), rng)
+    factors = rng.uniform(1.0 - spread, 1.0 + spread, (2, *pressure_kpa.shape))
+    settle_one = _settle_loaded if hangs(spec) else _settle_loaded_by_law
+    equilibria = _in_batches(settle_one, spec, pressure_kpa, load_kg, *factors)
+    n = len(load_kg) // CANDIDATES_PER_POSE
+    rows = _chosen(spec, equilibria, equilibria.settled, n, rng, replace=False)
     pool = _pool(equilibria, rows)
-    return LoadedPool(load_kg[rows].astype(np.float32), *pool)
+    return pool._replace(load_kg=np.float32(load_kg[rows]))
 
 
 def sample_evenly(spec: ArmSpec, n: int, seed: Seed) -> Pool:
-    """Draw poses whose tips are uniform in volume over the reachable workspace, rim included.
+    """Draw n poses whose tips are uniform in volume over the reachable workspace, rim included.
 
     Voxels of 25 mm with a candidate are equally likely, and so are the candidates within a voxel. Of ten
     candidates per pose, half have random pressures; the others combine lowest, zero and highest pressures at
     random, which gives the rim. Candidates are left out that did not settle, or that have a spring beyond the
     limits, which no policy can ask for. A pose may come twice.
-
-    Args:
-        spec: the arm.
-        n: number of poses.
-        seed: of the draw; training and evaluation use different ones.
 
     Raises:
         SpecError: the arm settles, its springs within their limits, at fewer than `n` of the candidates.
@@ -165,12 +149,7 @@ def sample_evenly(spec: ArmSpec, n: int, seed: Seed) -> Pool:
 
 
 def _chosen(
-    spec: ArmSpec,
-    equilibria: Settled,
-    usable: np.ndarray | Array,
-    n: int,
-    rng: np.random.Generator,
-    replace: bool,
+    spec: ArmSpec, equilibria: Settled, usable: Array, n: int, rng: np.random.Generator, replace: bool
 ) -> np.ndarray:
     """Draw rows (n,) of usable equilibria with weights that even out the number of tips per voxel."""
     # Number of candidates in the voxel of each one

@@ -57,8 +57,8 @@ class Stage:
 
         def copies(path: str, mesh: trimesh.Trimesh, at: Copies, colour):
             batch = mesh.vertices, mesh.faces, at.quaternion, at.position_m
-            colours = np.tile(np.array(colour, np.uint8), (len(at.pitch_m), 1))
-            looks = {"batched_scales": at.scales, "batched_colors": colours, "lod": "off"}
+            colours = np.tile(np.array(colour, np.uint8), (len(at.scale), 1))
+            looks = {"batched_scales": at.scale, "batched_colors": colours, "lod": "off"}
             return scene.add_batched_meshes_simple(f"{name}/{path}", *batch, **looks)
 
         def points(path: str, colour, size_m: float):
@@ -96,7 +96,7 @@ class Stage:
         now = shape(self._spec, self._spring_m, look.tip)
         for handle, copies in ((self._rings, now.rings), (self._folds, now.folds), (self._coils, now.coils)):
             handle.batched_positions, handle.batched_wxyzs = copies.position_m, copies.quaternion
-            handle.batched_scales = copies.scales
+            handle.batched_scales = copies.scale
         self._mark(look.saturated)
         self._tip.position, self._tip.wxyz = now.rings.position_m[-1], now.rings.quaternion[-1]
         self._payload.visible = look.payload_kg > 0.0

@@ -7,7 +7,8 @@ import numpy as np
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.mechanics.kinematics import ChainKinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from tests.arms import SHORT
 
@@ -32,7 +33,7 @@ def test_in_motion_the_clearance_is_the_least_of_the_way(quick_compiler):
     np.testing.assert_allclose(end.info["clearance_mm"], least_mm, atol=0.01)
     assert (least_mm < way[-1] - 0.1).any() and (least_mm == way[-1]).any()
     # Against kinematics in closed form
-    frames = jax.vmap(ChainKinematics(SHORT.link_length_m))(end.pipeline_state.motion.q)
+    frames = jax.vmap(chain_kinematics(ArmParams.from_spec(SHORT)))(end.pipeline_state.motion.q)
     plates = frames.plate_position, frames.plate_rotation
-    wall_m = body_clearance(CrossPipe.of_mm(300.0), *plates, SHORT)
+    wall_m = body_clearance(CrossPipe(300.0), *plates, SHORT)
     np.testing.assert_allclose(way[-1], wall_m / MM, atol=0.02)

@@ -9,7 +9,8 @@ import pytest
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.mechanics.kinematics import ChainKinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import frame_from_pose
 from tests.arms import SHORT
@@ -47,11 +48,11 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
         np.testing.assert_allclose(seen.pose[:, 1] - arm.pose[:, 1], -4.0, atol=0.01)
         assert np.abs(seen.pose[:, 3:] - arm.pose[:, 3:]).max() > 1.0
         np.testing.assert_allclose(other.obs, real.observe(seen.pose, seen.goal), atol=1e-5)
-        frames = jax.vmap(ChainKinematics(SHORT.link_length_m))(arm.motion.q)
+        frames = jax.vmap(chain_kinematics(ArmParams.from_spec(SHORT)))(arm.motion.q)
         share = jnp.array([0.0, 0.5, 1.0])[:, None]  # base, between the two links, tip
         plates_m = frames.plate_position + share * MM * (seen.pose - arm.pose)[:, None, :3]
         rotation = frames.plate_rotation.at[:, -1].set(frame_from_pose(seen.pose)[1])
-        wall_m = body_clearance(CrossPipe.of_mm(300.0), plates_m, rotation, SHORT)
+        wall_m = body_clearance(CrossPipe(300.0), plates_m, rotation, SHORT)
         np.testing.assert_allclose(other.info["clearance_mm"], wall_m / MM, atol=0.02)
         assert np.abs(other.info["clearance_mm"] - one.info["clearance_mm"]).max() > 1.0
     np.testing.assert_allclose(real.pool.pose[:, 1] - plain.pool.pose[:, 1], -4.0, atol=0.01)

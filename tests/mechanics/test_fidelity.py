@@ -1,31 +1,27 @@
-"""Settled arm, stepped MJX and stepped C MuJoCo come to the same rest under the sensor-space law.
+"""Settled arm and stepped C MuJoCo come to the same rest under the sensor-space law.
 
 The truth is C MuJoCo with the law in the loop, stepped until nothing moves. A rest depends on neither the
 time step nor the damping nor the law's gains, so the truth is taken with those that come to rest soonest, and
 one test holds it against the arm's own.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.speed.truth import random_references
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
-from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
-from tests.arms import OTHER_ARMS, SHORT
+from tests.arms import OTHER_ARMS
 
 SPEC = ArmSpec.default()
 GAINS = control.Gains.from_spec(SPEC)
-N = 128
-POSITION_MM, ANGLE_DEG = 0.1, 0.1
 
 # Soonest at rest: one second a step, every damper worth four seconds of its spring, and strong gains.
 FAST_STEP_S, FAST_DAMPING_S = 1.0, 4.0
@@ -41,12 +37,6 @@ class Rest(NamedTuple):
     tip_position_m: np.ndarray
     tip_rotation: np.ndarray
     residual: np.ndarray  # () largest force that is left on the standing arm [N, N m]
-
-
-def references(n, seed, spec=SPEC):
-    """Spring lengths (n, springs) over all that may be commanded."""
-    low, high = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
-    return np.random.default_rng(seed).uniform(low, high, (n, spec.n_springs))
 
 
 def fast_model(spec=SPEC):
@@ -89,104 +79,44 @@ def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11
     )
 
 
-@functools.cache
-def truth(n, seed, spec=SPEC):
-    """Rests of C MuJoCo at random references."""
+def truth(reference_m, spec):
+    """Rests of C MuJoCo at references (n, n_springs)."""
     model, gains = fast_model(spec), FAST_GAINS._replace(allocation=control.allocation(spec))
-    rests = [stepped_to_rest(model, reference, gains) for reference in references(n, seed, spec)]
+    rests = [stepped_to_rest(model, reference, gains) for reference in reference_m]
     return Rest(*map(np.stack, zip(*rests, strict=True)))
 
 
-@functools.cache
-def settled(n, seed, spec=SPEC):
-    """`settle` at the same references."""
-    params = ArmParams.from_spec(spec)
-    many = xla.jit(jax.vmap(lambda x: settle(params, x)))
-    return jax.device_get(many(np.float32(references(n, seed, spec))))
-
-
-def position_error_mm(a, b):
-    return 1e3 * np.linalg.norm(a.tip_position_m - b.tip_position_m, axis=-1)
-
-
-def angle_error_deg(a, b):
-    chord = np.linalg.norm(a.tip_rotation - b.tip_rotation, axis=(-2, -1))
-    return np.rad2deg(2.0 * np.arcsin(chord / np.sqrt(8.0)))
-
-
 def test_neither_time_step_nor_damping_nor_gains_move_the_rest():
-    model, fast = build_model(SPEC), truth(N, 0)
+    model, reference_m = build_model(SPEC), random_references(SPEC, 3)
     steps = round(1.0 / (SPEC.control.rate_hz * model.opt.timestep))
+    fast = truth(reference_m, SPEC)
     for k in range(3):
-        own = stepped_to_rest(model, references(N, seed=0)[k], GAINS, steps, tolerance=1e-6)
+        own = stepped_to_rest(model, reference_m[k], GAINS, steps, tolerance=1e-6)
         np.testing.assert_allclose(own.q, fast.q[k], atol=1e-5)
         np.testing.assert_allclose(own.tip_position_m, fast.tip_position_m[k], atol=2e-6)
         np.testing.assert_allclose(own.pressure_kpa, fast.pressure_kpa[k], atol=1e-2)
 
 
-def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
-    model = mjx.put_model(fast_model(SHORT))
-    n_ticks = 300
-
-    def rest_of(reference):
-        def tick(carry, _):
-            data, law = carry
-            pressure, law = control.pressures(
-                reference, spring_lengths(data, model.nu, model.nu), law, FAST_GAINS, FAST_STEP_S
-            )
-            return (mjx.step(model, data.replace(ctrl=pressure)), law), None
-
-        straight_m = jnp.full(model.ntendon, SPEC.geometry.section_length_m)
-        start = mjx.make_data(model).replace(ten_length=straight_m)
-        law = control.LawState.at_rest(jnp.zeros(model.nu), spring_lengths(start, model.nu, model.nu))
-        (data, law), _ = jax.lax.scan(tick, (start, law), None, length=n_ticks)
-        return data.qpos, data.qvel, law.integral_kpa
-
-    q, velocity, pressure = xla.jit(jax.vmap(rest_of))(np.float32(references(N, 0, SHORT)))
-    assert np.abs(velocity).max() < 1e-6
-    rest = truth(N, 0, SHORT)
-    found = at_q(q)
-    assert position_error_mm(found, rest).max() < POSITION_MM / 10
-    assert angle_error_deg(found, rest).max() < ANGLE_DEG / 10
-    np.testing.assert_allclose(pressure, rest.pressure_kpa, atol=0.02)
-
-
-def at_q(q):
-    """Tips of joint coordinates, from C MuJoCo; only the tips' fields are filled."""
-    model = build_model(SHORT)
-    data = mujoco.MjData(model)
-    position, rotation = [], []
-    for row in np.asarray(q):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        position.append(data.site("tip").xpos.copy())
-        rotation.append(data.site("tip").xmat.reshape(3, 3).copy())
-    return Rest(None, None, None, np.stack(position), np.stack(rotation), None)
-
-
 @pytest.mark.parametrize(
-    "arm, n, seed",
-    [
-        ("paper", N, 0),
-        pytest.param("paper", 4096, 1, marks=pytest.mark.slow),
-        *((arm, 32, 0) for arm in OTHER_ARMS),
-    ],
+    "arm, n",
+    [("paper", 128), pytest.param("paper", 4096, marks=pytest.mark.slow), *((arm, 32) for arm in OTHER_ARMS)],
 )
-def test_the_settled_arm_is_where_c_mujoco_comes_to_rest(arm, n, seed):
+def test_the_settled_arm_is_where_c_mujoco_comes_to_rest(arm, n):
     """Redundant chambers, too, whose pressures rest where the law takes them."""
     spec = OTHER_ARMS.get(arm, SPEC)
-    reference, rest = references(n, seed, spec), truth(n, seed, spec)
-    found, matrices = settled(n, seed, spec), control.allocation(spec)
-    error_mm = position_error_mm(found, rest)
+    reference_m, params = random_references(spec, n), ArmParams.from_spec(spec)
+    rest = truth(reference_m, spec)
+    found = jax.device_get(xla.jit(jax.vmap(lambda x: settle(params, x)))(np.float32(reference_m)))
     saturated = (rest.pressure_kpa <= GAINS.pressure_min_kpa) | (rest.pressure_kpa >= GAINS.pressure_max_kpa)
     assert rest.residual.max() < 1e-6 and 0.2 < saturated.mean() < 0.8
     assert found.settled.mean() > 0.999
-    assert error_mm[found.settled].max() < POSITION_MM / 10
-    assert angle_error_deg(found, rest)[found.settled].max() < ANGLE_DEG / 10
+    off_m = np.linalg.norm(found.tip_position_m - rest.tip_position_m, axis=-1)
+    chord = np.linalg.norm(found.tip_rotation - rest.tip_rotation, axis=(-2, -1))
+    angle_deg = np.rad2deg(2.0 * np.arcsin(chord / np.sqrt(8.0)))
+    assert off_m[found.settled].max() < 1e-5 and angle_deg[found.settled].max() < 0.01
     assert np.abs(found.spring_m - rest.spring_m)[found.settled].max() < 1e-5
     assert np.abs(found.pressure_kpa - rest.pressure_kpa)[found.settled].max() < 0.02
-    off_m = reference - found.spring_m
-    if matrices is not None:
-        off_m = control.allocated_error(off_m, found.pressure_kpa, matrices)
-    assert np.abs(off_m)[~saturated].max() < 0.2e-3
+    error_m = reference_m - found.spring_m
+    error_m = control.allocated_error(error_m, found.pressure_kpa, control.allocation(spec))
+    assert np.abs(error_m)[~saturated].max() < 0.2e-3
     np.testing.assert_array_equal(found.at_limit, saturated)

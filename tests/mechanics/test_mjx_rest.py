@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.speed.truth import random_references
 from mjx_softarm._support import xla
 from mjx_softarm._support.lazy import put
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
@@ -26,10 +27,8 @@ def at_rest(request):
     params = ArmParams.from_spec(spec)
     params = params._replace(tool_mass_kg=np.float32(params.tool_mass_kg)).stiffened(np.float32(STIFFER))
     params.tool_mass_kg[PAYLOAD] = LOADED_KG
-    shortest, longest = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
-    reference = np.random.default_rng(0).uniform(shortest, longest, (N, spec.n_springs)).astype(np.float32)
     solve = jax.vmap(lambda r: settle(params, r))
-    proposed = xla.jit(solve)(reference)
+    proposed = xla.jit(solve)(np.float32(random_references(spec, N)))
     assert proposed.settled.all() and np.asarray(proposed.at_limit).any(axis=1).mean() > 0.25
     model, data = put(build_model(spec))
     measure = xla.jit(jax.vmap(lambda p: measured(model, data, params, p)))

@@ -9,8 +9,9 @@ from scipy.spatial import ConvexHull
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.mechanics.drawing.render import RenderError
-from mjx_softarm.mechanics.kinematics import ChainKinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_spec
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance, clearance
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import Build
@@ -18,7 +19,7 @@ from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.pipe import CONTAINER, N_PLANKS, _walls, add_pipe, contact_force_n, is_wall
 from tests.twin.conftest import KPA, hold
 
-PIPE = CrossPipe.of_mm(300.0)
+PIPE = CrossPipe(300.0)
 R, Z = 0.15, -0.55
 QUIET = Build(losses=0.0, noise=0.0)
 
@@ -50,12 +51,12 @@ def test_walls_enclose_the_pipe_without_a_hole():
 def test_arm_touches_where_its_body_has_no_clearance(diameter_mm):
     """Bent at random, nominal; skin and planks differ from `body_clearance` by 2 mm at most."""
     parts = draw_parts(0, ArmSpec.default(), Build(gap=0.0))
-    pipe, spec, rng = CrossPipe.of_mm(diameter_mm), parts.spec, np.random.default_rng(0)
+    pipe, spec, rng = CrossPipe(diameter_mm), parts.spec, np.random.default_rng(0)
     section = np.concatenate(
         [rng.uniform(-0.006, 0.002, (200, 3, 1)), rng.normal(0.0, 0.018, (200, 3, 2))], -1
     )
     q = np.repeat(section, spec.structure.links_per_section, axis=1).reshape(200, -1)
-    frames = jax.jit(jax.vmap(ChainKinematics(spec.link_length_m)))(np.float32(q))
+    frames = jax.jit(jax.vmap(chain_kinematics(ArmParams.from_spec(spec))))(np.float32(q))
     free_m = np.asarray(body_clearance(pipe, frames.plate_position, frames.plate_rotation, spec))
     model = build_twin(parts, pipe)
     data, wall = mujoco.MjData(model), is_wall(model)
@@ -155,7 +156,7 @@ def test_arm_that_touches_nothing_moves_as_without_a_pipe():
 
 def test_survives_random_extremes_in_the_pipe():
     """Chambers at their limits, redrawn at random; only arm and pipe touch, and the arm stays inside."""
-    pipe = CrossPipe.of_mm(250.0)
+    pipe = CrossPipe(250.0)
     arm, rng, touched = Twin(0, pipe=pipe), np.random.default_rng(0), 0
     while arm.time_s < 16.0:
         arm.attach(rng.choice([0.0, 0.22]))
@@ -173,7 +174,7 @@ def test_survives_random_extremes_in_the_pipe():
 
 def test_arms_in_pipes_by_name():
     arm = open_arm("twin:7:pipe250")
-    assert arm._pipe == CrossPipe.of_mm(250.0) and open_arm("twin:7")._pipe is None
+    assert arm._pipe == CrossPipe(250.0) and open_arm("twin:7")._pipe is None
     in_pipe, loaded = open_arm("twin:7:pipe300"), open_arm("twin:7:pipe300:220g")
     assert in_pipe.wall_force_n == 0.0
     assert loaded.motion_capture().tip_m[2] < in_pipe.motion_capture().tip_m[2] - 1e-3

@@ -1,6 +1,6 @@
 """Learning through the simulation: its own gradient teaches the policy.
 
-The pose at rest is a differentiable function of the spring references (`mjx_softarm.mechanics.implicit`), and
+The pose at rest is a differentiable function of the spring references (`mjx_softarm.mechanics.settle`), and
 so is the pose in motion, through all time steps. So the policy a = pi(s) descends the pose's own error:
 
     loss = E[ ||e(a)|| / theta + c sum_t d_t(a) ]

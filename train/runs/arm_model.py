@@ -36,7 +36,6 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import (
     CANDIDATES_PER_POSE,
     HELD_OUT_SEED,
-    LoadedPool,
     Pool,
     sample_evenly,
     sample_loaded,
@@ -277,7 +276,7 @@ def _keys() -> Array:
     return jax.random.split(jax.random.key(SEED), 7)
 
 
-def _loaded(arm: CalibratedArm, many_kg: np.ndarray) -> LoadedPool:
+def _loaded(arm: CalibratedArm, many_kg: np.ndarray) -> Pool:
     """Draw held-out poses of arms with payloads [kg], off as far as the calibration does not tell."""
     pool = sample_loaded(arm.spec, many_kg, _chambers_off(arm), HELD_OUT_SEED)
     if arm.held is None:

@@ -75,8 +75,8 @@ def driven_kpa(commanded_kpa: np.ndarray, spring_m: np.ndarray | None, spec: Arm
         spec: arm with the actuators.
     """
     actuators = spec.actuators.per_chamber(spec.n_chambers)
-    offset_kpa = 0.0 if actuators.rest_offset_kpa is None else actuators.rest_offset_kpa
-    track = Track(commanded_kpa, commanded_kpa + offset_kpa, volumes_m3(spring_m, len(commanded_kpa), spec))
+    rest_kpa = commanded_kpa + actuators.rest_offset_kpa
+    track = Track(commanded_kpa, rest_kpa, volumes_m3(spring_m, len(commanded_kpa), spec))
     runs = Runs([track], 1.0 / spec.control.rate_hz)
     return runs.simulated([actuators])[0][:, 0]
 
@@ -184,8 +184,7 @@ class Runs:
     def simulated(self, actuators: Sequence[Actuators]) -> list[np.ndarray]:
         """Return the pressures (n, b, c) [kPa] of each track with b actuators of one kind."""
         delay_s = np.array([np.full(self.n_chambers, one.delay_s) for one in actuators])  # (b, c)
-        offsets = [0.0 if one.rest_offset_kpa is None else one.rest_offset_kpa for one in actuators]
-        offset_kpa = np.array([np.full(self.n_chambers, offset) for offset in offsets])
+        offset_kpa = np.array([np.full(self.n_chambers, one.rest_offset_kpa) for one in actuators])
         together = _stacked(actuators)
         return [self._run(track, together, delay_s, offset_kpa) for track in self.tracks]
 

@@ -50,14 +50,10 @@ class Camera:
 
 
 class Renderer:
-    """Renderer of one model. It holds an OpenGL context until it is closed, so a film opens only one."""
+    """Renderer of one model. It holds an OpenGL context while it is entered, so a film opens only one."""
 
     def __init__(self, model: mujoco.MjModel, width: int = 900, height: int = 1200):
-        """Open the context.
-
-        Args:
-            model: from `mjx_softarm.mechanics.mjcf`, with or without an environment around the arm.
-            width, height: size of the picture in pixels.
+        """Open the context for pictures of width x height pixels of a model of `mjx_softarm.mechanics.mjcf`.
 
         Raises:
             RenderError: there is no OpenGL to draw with.
@@ -72,7 +68,7 @@ class Renderer:
         self._arm_length_m = float(np.linalg.norm(self._data.body("gripper").xpos - self._base_m))
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0
-        self._renderer: mujoco.Renderer | None = _open_renderer(self._model, width, height)
+        self._renderer = _open_renderer(self._model, width, height)
 
     def draw(self, q: np.ndarray, camera: Camera | None = None, payload_radius_m: float = 0.0) -> np.ndarray:
         """Draw the arm at joint coordinates q (nq,) [m, rad]: RGB, (height, width, 3) uint8.
@@ -80,14 +76,8 @@ class Renderer:
         A payload that the model does not draw by itself is a ball of `payload_radius_m` at the finger tips.
 
         Raises:
-            ValueError: q has the wrong shape or is not finite.
-            RenderError: the renderer is closed.
+            ValueError: q is not finite.
         """
-        if self._renderer is None:
-            raise RenderError("renderer: got a closed one, expected it open")
-        q = np.asarray(q, float)
-        if q.shape != (self._model.nq,):
-            raise ValueError(f"q: got shape {q.shape}, expected ({self._model.nq},)")
         if not np.isfinite(q).all():
             raise ValueError("q: got numbers that are not finite, expected those of an arm that settled")
 
@@ -100,24 +90,16 @@ class Renderer:
         _draw_bellows(scene, self._model)
         _draw_mount(scene, self._base_m, self._base_rotation)
         if payload_radius_m > 0.0:
-            held = self._data.body("payload").xpos
-            ball = mujoco.mjtGeom.mjGEOM_SPHERE
-            size = np.full(3, payload_radius_m)
-            _append(scene, ball, size, held, np.eye(3), _PAYLOAD_COLOUR)
+            held, size = self._data.body("payload").xpos, np.full(3, payload_radius_m)
+            _append(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, held, np.eye(3), _PAYLOAD_COLOUR)
         _add_light(scene, np.radians(view.azimuth))
         return self._renderer.render()
-
-    def close(self) -> None:
-        """Free the context; the renderer draws no more."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
     def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self._renderer.close()
 
     def _camera(self, camera: Camera) -> mujoco.MjvCamera:
         view = mujoco.MjvCamera()
@@ -163,13 +145,9 @@ def _working_library() -> str:
         )
         if probe.returncode == 0:
             return name
-        tried.append(f"{name}: {next(filter(_is_error, probe.stderr.splitlines()), 'failed')}")
+        error = re.search(r"^[\w.]+(Error|Exception)\b.*", probe.stderr, re.MULTILINE)
+        tried.append(f"{name}: {error[0] if error else 'failed'}")
     raise RenderError(f"MUJOCO_GL: got {'; '.join(tried)}; expected OpenGL to draw with. {_ADVICE}")
-
-
-def _is_error(line: str) -> bool:
-    """Return whether a line of a traceback names the exception."""
-    return re.match(r"[\w.]+(Error|Exception)\b", line) is not None
 
 
 def _append(scene: mujoco.MjvScene, kind: mujoco.mjtGeom, size, position, rotation, rgba) -> None:
@@ -206,8 +184,6 @@ def _draw_mount(scene: mujoco.MjvScene, base_m: np.ndarray, base_rotation: np.nd
 
 def _add_light(scene: mujoco.MjvScene, azimuth: float) -> None:
     """Add a lamp over the camera's left shoulder, which gives the round parts their shape."""
-    if scene.nlight >= len(scene.lights):
-        return
     light = scene.lights[scene.nlight]
     light.headlight, light.castshadow, light.type = 0, 0, mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     heading = azimuth - np.radians(40.0)

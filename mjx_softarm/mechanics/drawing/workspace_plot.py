@@ -25,14 +25,9 @@ def paper_coverage_mm(spec: ArmSpec) -> tuple[float, float] | None:
 
 
 def outline(points: np.ndarray, gap: float) -> np.ndarray:
-    """Return the edges around a cloud of points, hollows included: its alpha shape.
+    """Return the edges (m, 2 ends, 2), in no order, around a cloud of points (n, 2): its alpha shape.
 
-    Args:
-        points (n, 2): the cloud.
-        gap: a hollow that a disc of this radius cannot enter is filled.
-
-    Returns:
-        Edges (m, 2 ends, 2) in no order; none where the cloud has no area.
+    A hollow is filled where a disc of radius `gap` cannot enter it. A cloud without an area has no edges.
     """
     try:
         triangles = Delaunay(points).simplices  # (t, 3)
@@ -51,10 +46,7 @@ def outline(points: np.ndarray, gap: float) -> np.ndarray:
 def draw_workspace(path: Path, spec: ArmSpec, tip_mm: np.ndarray) -> None:
     """Draw the paper's workspace figure: tips coloured by distance, and their projection with its boundary.
 
-    Args:
-        path: PNG file to write.
-        spec: the arm.
-        tip_mm (n, 3) [mm]: tip positions in the base frame, at the combinations of extreme pressures.
+    The tips (n, 3) [mm] in the base frame are those at the combinations of extreme pressures.
     """
     distance = np.linalg.norm(tip_mm, axis=1)
     with rc_context({"font.size": 12, "axes.titlesize": 13, "axes.titlelocation": "left"}):

@@ -43,8 +43,6 @@ from mjx_softarm.mechanics.motion.state import (
     MovingArm,
     Path,
     friction_damping,
-    in_force,
-    pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2, ArmParams
 from mjx_softarm.mechanics.statics import (
@@ -68,7 +66,7 @@ def advance(
     step_s: float,
     n_at_once: int | None = None,
 ) -> tuple[Motion, MotionEnd]:
-    """Run the arm for a while under the law.
+    """Run the arm for a while under the law; return state and observables at the end.
 
     The gradient is by `motion` and `reference_m`; numbers of the arm count as constants. It ignores the
     derivatives of each step's matrix and of c. It then takes half the time, and its direction is within 5
@@ -83,9 +81,6 @@ def advance(
         period_s: control period of the model's specification.
         step_s: time step at most; a control period has a whole number of them.
         n_at_once: arms of a `jax.vmap` that move at once, from `settle.arms_at_once`; None is all of them.
-
-    Returns:
-        State and observables at the end.
     """
     n_ticks, n_steps = round(duration_s / period_s), math.ceil(period_s / step_s - 1e-9)
     tick = functools.partial(_tick, arm, n_steps, period_s)
@@ -153,12 +148,7 @@ def _run_back(
 
 
 def _tick(
-    arm: MovingArm,
-    n_steps: int,
-    period_s: float,
-    constants: _Constants,
-    motion: Motion,
-    reference_m: Array,
+    arm: MovingArm, n_steps: int, period_s: float, constants: _Constants, motion: Motion, reference_m: Array
 ) -> tuple[Motion, Path]:
     """Run one control period: observe, let the law command pressures, take the time steps."""
     gains, params, own = constants
@@ -170,11 +160,10 @@ def _tick(
     command, law = control.pressures(*law_inputs, dt_s=period_s)
     command, law = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (command, law)) if arms else (command, law)
 
-    earlier = pushed(motion.earlier_kpa, motion.command_kpa)
     motion, arm = motion._replace(law=law), arm._replace(params=params, own=own)
     for k in range(n_steps):
         motion = _step(arm, motion, command, k, period_s / n_steps, period_s)
-    return motion._replace(command_kpa=command, earlier_kpa=earlier), seen
+    return motion.commanded(command), seen
 
 
 def _look(params: ArmParams, q: Array) -> Path:
@@ -210,22 +199,16 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     frames, tendons = _at(params, jax.lax.stop_gradient(q))
     lines = _sloped(Tendons.changed, tendons, q, tendons)
     chambers, _ = chambers_and_springs(lines, params)
-    n_sections, n_chambers, *arms = len(lines.length), *chambers.length.shape
-
-    def rates(jacobian: Array, velocity: Array) -> Array:
-        """Return the rates (n_sections, t, *arms) of tendons at velocities (nv, *arms)."""
-        return products(jacobian, velocity.reshape(n_sections, -1, 1, *arms))[:, :, 0]
+    n_sections, arms = len(lines.length), v.shape[1:]
 
     def volume_m3(displacement: Array) -> Array:
         """Return the chambers' volumes (n_chambers, *arms) at displacements (nv, *arms) from the middle."""
-        along = rates(chambers.jacobian, displacement).reshape(n_chambers, *arms)
-        area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
-        return pneumatics.volume_m3(chambers.length + along, *area, params.free_length_m)
+        along = _rates(chambers.jacobian, displacement).reshape(chambers.length.shape)
+        return params.volume_m3(chambers.length + along)
 
     def fill(gas_m3: Array, volume: Array, half: int) -> Array:
         """Return the gas (n_chambers, *arms) after a half step, counted from the start of the period."""
-        line = command_kpa, motion.command_kpa, motion.earlier_kpa
-        command = in_force(*line, half, 0.5 * h, arm.own.delay_s, period_s)
+        command = motion.in_force(command_kpa, half, 0.5 * h, arm.own.delay_s, period_s)
         return actuators.fill(gas_m3, volume, command, 0.5 * h)
 
     # Pressures in the middle of the step
@@ -240,7 +223,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     constant = jax.lax.stop_gradient((tendons, frames, q, pressure_kpa))
     potential, (mass, bias) = statics_of(*constant, params), inertia(arm, frames, jax.lax.stop_gradient(v))
     gradient = _sloped(Statics.changed, potential.gradient, (q, pressure_kpa), potential)
-    rate = rates(lines.jacobian, v)
+    rate = _rates(lines.jacobian, v)
     damping, of_joints = _dampers(arm, rate)
     pull = jnp.sum((damping * rate)[:, :, None] * lines.jacobian, axis=1)  # (n_sections, n, *arms)
     force = gradient + bias + pull.reshape(v.shape) + of_joints * v
@@ -264,22 +247,24 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     )
 
 
-def _dampers(arm: MovingArm, rate: Array) -> tuple[Array, Array]:
-    """Return dampers and dry friction of tendons with these rates (n_sections, t, *arms), and of the joints.
+def _rates(jacobian: Array, velocity: Array) -> Array:
+    """Return the rates (n_sections, t, *arms) of tendons at velocities (nv, *arms)."""
+    return products(jacobian, velocity.reshape(len(jacobian), -1, 1, *velocity.shape[1:]))[:, :, 0]
 
-    Returns:
-        (n_sections, t, *arms) [N s/m] and (nv, *arms).
-    """
-    # Friction is the chambers' alone
+
+def _dampers(arm: MovingArm, rate: Array) -> tuple[Array, Array]:
+    """Return dampers of tendons with these rates, both (n_sections, t, *arms), and of joints (nv, *arms)."""
     of_tendons, of_joints = (
         arm.own.damping * x.reshape(-1, *[1] * (rate.ndim - 2))
         for x in (arm.model.tendon_damping, arm.model.dof_damping)
     )
     n_sections, n_chambers = len(rate), len(arm.params.area)
-    friction = friction_damping(arm.own.friction_n, rate[:, : n_chambers // n_sections])
     n_both = n_chambers + len(arm.params.spring_rest_m)
     damping = joined(of_tendons[:n_chambers], of_tendons[n_chambers:n_both], n_sections)
     damping = jnp.broadcast_to(damping, rate.shape)
+
+    # Dry friction is the chambers' alone
+    friction = friction_damping(arm.own.friction_n, rate[:, : n_chambers // n_sections])
     return damping.at[:, : friction.shape[1]].add(friction), of_joints
 
 

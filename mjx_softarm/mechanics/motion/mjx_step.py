@@ -20,7 +20,6 @@ Source: MuJoCo's documentation, "Computation", numerical integration.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,28 +29,7 @@ from mjx_softarm import control, pneumatics
 from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.kinematics import frames_of
 from mjx_softarm.mechanics.mjcf import chamber_lengths, episode_model, spring_lengths
-from mjx_softarm.mechanics.motion.state import (
-    Motion,
-    MotionEnd,
-    MovingArm,
-    Path,
-    friction_damping,
-    in_force,
-    pushed,
-)
-from mjx_softarm.mechanics.params import N_PER_KPA_M2
-
-
-class _Moving(NamedTuple):
-    """State between two time steps."""
-
-    q: Array  # (nv,)
-    velocity: Array  # (nv,)
-    gas_m3: Array  # (n_chambers,) in the chambers, at atmospheric pressure
-    law: control.LawState
-    before_kpa: Array  # (n_chambers,) command of the control period before
-    command_kpa: Array  # (n_chambers,) command of this control period
-    earlier_kpa: Array | None  # (k, n_chambers) commands before those, newest first
+from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MovingArm, Path, friction_damping
 
 
 def advance(
@@ -63,51 +41,40 @@ def advance(
     period_s: float,
     step_s: float,
 ) -> tuple[Motion, MotionEnd]:
-    """Run the arm for a while under the law; arguments and results are those of `midpoint.advance`.
-
-    The scan runs over time steps rather than control periods, so that `mjx.step` is compiled once.
-    """
+    """Run the arm for a while under the law; arguments and results are those of `midpoint.advance`."""
     n_steps = math.ceil(period_s / step_s - 1e-9)
     h = period_s / n_steps
-    model = _episode_model(arm, h)
+    model, own = _episode_model(arm, h), arm.own
 
-    def step(now: _Moving, k: Array) -> tuple[_Moving, Path]:
-        """Take the k-th time step of a control period: observe, command, fill the chambers, step."""
-        # Lengths at the start of the step; `mjx.step` computes them again, and it is not measured whether XLA
-        # merges the two
-        data, spring_m, volume = _at(arm, model, now.q, now.velocity)
+    def run_period(state: tuple[Motion, Array], _: None) -> tuple[tuple[Motion, Array], Path]:
+        """Run one control period: observe, let the law command pressures, take the time steps."""
+        motion, gas_m3 = state
+        data, spring_m, _volume = _at(arm, model, motion.q, motion.velocity)
+        command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
 
-        # The law commands pressures at the start of a control period
-        command, law = control.pressures(reference_m, spring_m, now.law, gains, period_s)
-        earlier = pushed(now.earlier_kpa, now.before_kpa)
-        line = {"before_kpa": now.command_kpa, "command_kpa": command, "earlier_kpa": earlier}
-        new = now._replace(law=law, **line)
-        now = jax.tree.map(lambda x, y: jnp.where(k == 0, x, y), new, now)
+        def step(moving: tuple[Array, Array, Array], k: Array) -> tuple[tuple[Array, Array, Array], None]:
+            """Fill the chambers by the commands whose dead time is over, then take MJX's own step."""
+            q, velocity, gas_m3 = moving
+            # `mjx.step` computes the lengths again, and it is not measured whether XLA merges the two
+            data, _, volume = _at(arm, model, q, velocity)
+            in_force_kpa = motion.in_force(command, k, h, own.delay_s, period_s)
+            gas_m3 = own.actuators.fill(gas_m3, volume, in_force_kpa, h)
+            data = data.replace(ctrl=pneumatics.pressure_of(gas_m3, volume))
+            data = mjx.step(_with_friction(arm, model, data), data)
+            return (data.qpos, data.qvel, gas_m3), None
 
-        # The actuators act on the commands whose dead time is over
-        told_kpa = in_force(now.command_kpa, now.before_kpa, now.earlier_kpa, k, h, arm.own.delay_s, period_s)
-        gas_m3 = arm.own.actuators.fill(now.gas_m3, volume, told_kpa, h)
-
-        # MJX's own step
-        data = data.replace(ctrl=pneumatics.pressure_of(gas_m3, volume))
-        data = mjx.step(_with_friction(arm, model, data), data)
-        now = now._replace(q=data.qpos, velocity=data.qvel, gas_m3=gas_m3)
-        return now, Path.at(frames_of(model, data), spring_m)  # the data's frames are those of the start
+        moving = motion.q, motion.velocity, gas_m3
+        (q, velocity, gas_m3), _ = jax.lax.scan(step, moving, jnp.arange(n_steps))
+        end = motion._replace(q=q, velocity=velocity, law=law).commanded(command)
+        return (end, gas_m3), Path.at(frames_of(model, data), spring_m)
 
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         _, _, volume = _at(arm, model, motion.q, motion.velocity)
-        gas_m3 = pneumatics.gas_at(motion.pressure_kpa, volume)
-        before, earlier = motion.command_kpa, motion.earlier_kpa
-        if earlier is not None:  # the first control period shifts them by one
-            before, earlier = earlier[0], jnp.concatenate([earlier[1:], earlier[-1:]])
-        start = _Moving(*motion[:2], gas_m3, motion.law, before, motion.command_kpa, earlier)
-        of_period = jnp.tile(jnp.arange(n_steps), round(duration_s / period_s))
-        end, path = jax.lax.scan(step, start, of_period)
-        data, spring_m, volume = _at(arm, model, end.q, end.velocity)
-    pressure_kpa = pneumatics.pressure_of(end.gas_m3, volume)
-    line = end.command_kpa, pushed(end.earlier_kpa, end.before_kpa)
-    motion = Motion(end.q, end.velocity, end.law, pressure_kpa, *line)
-    path = jax.tree.map(lambda x: x[::n_steps], path)
+        start = motion, pneumatics.gas_at(motion.pressure_kpa, volume)
+        n_periods = round(duration_s / period_s)
+        (motion, gas_m3), path = jax.lax.scan(run_period, start, None, length=n_periods)
+        data, spring_m, volume = _at(arm, model, motion.q, motion.velocity)
+    motion = motion._replace(pressure_kpa=pneumatics.pressure_of(gas_m3, volume))
     return motion, MotionEnd.of(motion, Path.at(frames_of(model, data), spring_m), path)
 
 
@@ -124,10 +91,9 @@ def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
 def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mjx.Data, Array, Array]:
     """Return data at q and velocity (nv,), spring lengths (n_springs,) [m] and chamber volumes, as felt."""
     data = mjx.com_pos(model, mjx.kinematics(model, arm.data.replace(qpos=q, qvel=velocity)))
-    data, params = mjx.tendon(model, data), arm.params
-    area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
-    volume = pneumatics.volume_m3(chamber_lengths(data, len(params.area)), *area, params.free_length_m)
-    spring_m = spring_lengths(data, len(params.area), len(params.spring_rest_m))
+    data, n_chambers = mjx.tendon(model, data), len(arm.params.area)
+    volume = arm.params.volume_m3(chamber_lengths(data, n_chambers))
+    spring_m = spring_lengths(data, n_chambers, len(arm.params.spring_rest_m))
     return data, spring_m, arm.own.actuators.felt(volume)
 
 

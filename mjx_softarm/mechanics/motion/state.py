@@ -50,21 +50,47 @@ class Motion(NamedTuple):
         pressure_kpa: Array,
         spring_m: Array,
         n_earlier: int = 0,
-        offset_kpa: Array | float | None = None,
+        offset_kpa: Array | float = 0.0,
     ) -> Motion:
-        """Return the state of an arm at rest.
+        """Return the state of an arm at rest at q (nv,), pressures (n_chambers,) and lengths (n_springs,).
 
-        Args:
-            q (nv,): joint coordinates.
-            pressure_kpa (n_chambers,): pressures in the chambers.
-            spring_m (n_springs,): spring lengths.
-            n_earlier: number of commands before the last one.
-            offset_kpa (n_chambers,): pressures at rest less their commands; None for none.
+        The offset, () or (n_chambers,), is that of pressures at rest from their commands.
         """
-        command = pressure_kpa if offset_kpa is None else pressure_kpa - offset_kpa
+        command = pressure_kpa - offset_kpa
         earlier = jnp.tile(command, (n_earlier, 1)) if n_earlier else None
         law = control.LawState.at_rest(command, spring_m)
         return cls(q, jnp.zeros_like(q), law, pressure_kpa, command, earlier)
+
+    def commanded(self, command_kpa: Array) -> Motion:
+        """Return the state with a newer command (n_chambers,)."""
+        earlier = self.earlier_kpa
+        if earlier is not None:
+            earlier = jnp.concatenate([self.command_kpa[None], earlier[:-1]])
+        return self._replace(command_kpa=command_kpa, earlier_kpa=earlier)
+
+    def in_force(
+        self, command_kpa: Array, k: Array | int, h: float, delay_s: Array | float, period_s: float
+    ) -> Array:
+        """Return the mean command (n_chambers,) that actuators act on in an interval of a control period.
+
+        Args:
+            command_kpa (n_chambers,): command of this control period; the state has those before.
+            k: index of the interval.
+            h: length of the interval, no longer than a control period.
+            delay_s () or (n_chambers,): dead time.
+            period_s: control period.
+        """
+        # Share of the interval after the dead time, in which the new command is in force
+        new = jnp.clip(k + 1.0 - delay_s / h, 0.0, 1.0)
+        if self.earlier_kpa is None:
+            return self.command_kpa + new * (command_kpa - self.command_kpa)
+
+        # Each command is in force from its dead time on; the oldest one was before all others
+        line = jnp.concatenate([command_kpa[None], self.command_kpa[None], self.earlier_kpa])
+        age_s = period_s * jnp.arange(len(line) - 1, dtype=float).reshape(-1, *[1] * command_kpa.ndim)
+        left_s = jnp.broadcast_to(delay_s, command_kpa.shape)[None] - age_s
+        share = jnp.clip(k + 1.0 - left_s / h, 0.0, 1.0)  # (n commands, n_chambers)
+        return line[-1] + jnp.sum(share * (line[:-1] - line[1:]), axis=0)
 
 
 class Path(NamedTuple):
@@ -126,46 +152,6 @@ class MovingArm(NamedTuple):
 def n_earlier(delay_s: float, period_s: float) -> int:
     """Return the number of commands before the last one that a dead time of up to delay_s keeps waiting."""
     return max(math.ceil(delay_s / period_s - 1e-6) - 1, 0)
-
-
-def pushed(earlier_kpa: Array | None, command_kpa: Array) -> Array | None:
-    """Return earlier commands (k, n_chambers) with command_kpa (n_chambers,) as their newest."""
-    if earlier_kpa is None:
-        return None
-    return jnp.concatenate([command_kpa[None], earlier_kpa[:-1]])
-
-
-def in_force(
-    command_kpa: Array,
-    before_kpa: Array,
-    earlier_kpa: Array | None,
-    k: Array | int,
-    h: float,
-    delay_s: Array | float,
-    period_s: float,
-) -> Array:
-    """Return the mean command (n_chambers,) that actuators act on in an interval of a control period.
-
-    Args:
-        command_kpa (n_chambers,): command of this control period.
-        before_kpa (n_chambers,): command of the control period before.
-        earlier_kpa (m, n_chambers): commands before that one, newest first; None: none is in force any more.
-        k: index of the interval.
-        h: length of the interval, no longer than a control period.
-        delay_s () or (n_chambers,): dead time.
-        period_s: control period.
-    """
-    # Share of the interval after the dead time, in which the new command is in force
-    new = jnp.clip(k + 1.0 - delay_s / h, 0.0, 1.0)
-    if earlier_kpa is None:
-        return before_kpa + new * (command_kpa - before_kpa)
-
-    # Each command is in force from its dead time on; the oldest one was before all others
-    line = jnp.concatenate([command_kpa[None], before_kpa[None], earlier_kpa])
-    age_s = period_s * jnp.arange(len(line) - 1, dtype=float).reshape(-1, *[1] * command_kpa.ndim)
-    left_s = jnp.broadcast_to(delay_s, command_kpa.shape)[None] - age_s
-    share = jnp.clip(k + 1.0 - left_s / h, 0.0, 1.0)  # (m + 1, n_chambers)
-    return line[-1] + jnp.sum(share * (line[:-1] - line[1:]), axis=0)
 
 
 def friction_damping(friction_n: Array | float, rate: Array) -> Array:

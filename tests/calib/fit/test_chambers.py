@@ -12,7 +12,8 @@ from calib.fit.parameters import FIELDS
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import allocation
 from mjx_softarm.mechanics import excitation
-from mjx_softarm.mechanics.kinematics import ChainKinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.spec import BONDS
 from tests.arms import OTHER_ARMS
@@ -112,7 +113,7 @@ def test_without_springs_stiffness_and_area_come_back_and_the_offsets_are_said_t
 def end_markers(arm, n, seed, site_m):
     """Markers (n, n_sections, 3) of the poses of `pose_log` at sites of the sections' last plates."""
     found = settle_many(arm, random_pressures(n, seed))
-    frames = jax.jit(jax.vmap(ChainKinematics(arm.link_length_m)))(found.q)
+    frames = jax.jit(jax.vmap(chain_kinematics(ArmParams.from_spec(arm))))(found.q)
     step = arm.structure.links_per_section
     place, turn = frames.plate_position[:, step::step], frames.plate_rotation[:, step::step]
     marker_m = place + np.einsum("nsij,sj->nsi", turn, site_m)

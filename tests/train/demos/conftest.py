@@ -29,7 +29,7 @@ def shifting_s2r(spec):
 @pytest.fixture(scope="session")
 def expert(spec, shifting_s2r):
     """The paper's arm in the 300 mm pipe, believed to be off by `shift_mm`."""
-    return Expert(spec, shifting_s2r, CrossPipe.of_mm(300))
+    return Expert(spec, shifting_s2r, CrossPipe(300))
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from train.demos import expert as module
 from train.demos.expert import LIMIT_SHARE, MARGIN_KPA, MARGIN_M, SPRING_MARGIN_M, WAY, ExpertError
 from train.demos.waypoints import FREE, SQUARE, TASKS, Waypoint, circle, task
 
-PIPE = CrossPipe.of_mm(300)
+PIPE = CrossPipe(300)
 
 
 def hold(spec, reference_m):
