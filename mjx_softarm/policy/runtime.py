@@ -54,7 +54,6 @@ def sensed(
     """Return the entries (k,) that a policy observes besides pose and goal, float32; None if there are none.
 
     Args:
-        policy: policy of any kind of observation.
         pose (6,) [mm, deg]: tip pose, as `tip_pose` gives it.
         spring_m (n,) [m]: spring lengths.
         motion: used by policies that observe motion.

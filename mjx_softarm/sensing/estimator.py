@@ -126,7 +126,6 @@ def first_moments(estimator: PoseEstimator, length: Array, sections: Frame, load
     They are about the section's end, in its axes.
 
     Args:
-        estimator: masses of the arm.
         length (..., n_sections, 1) [m]: lengths of the sections.
         sections: each section's end in the frame of its start, (..., n_sections).
         load_kg (..., 1) [kg]: payload.
@@ -153,10 +152,10 @@ def variables(
     """Return what the change of a section's end depends on, (..., N_VARIABLES).
 
     These are its shape, the direction against gravity, the torque of gravity on the masses below, over its
-    acceleration, and the payload. No variable depends on the change itself.
+    acceleration, and the payload.
 
     Args:
-        length, bend: of the section, (..., 1) [m] and (..., 2) [rad]; all sections may stand in "...".
+        length (..., 1) [m], bend (..., 2) [rad]: of the section.
         even_rotation (..., 3, 3): axes of its end in those of its start, of constant curvature.
         up (..., 3): direction against gravity in the axes of the section's start.
         moment (..., 3) [kg m]: of the masses below, see `first_moments`.

@@ -70,7 +70,6 @@ def held_kpa(
     """Return the pressures (m, n_chambers) [kPa] that hold the real arm.
 
     Args:
-        held: process of the arm.
         spring_m (m, n_springs) [m]: spring lengths.
         light_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm there without a payload.
         effect_kpa (m, n_chambers) [kPa]: simulated change of these pressures by the arm's payload.
