@@ -48,13 +48,6 @@ def test_default_is_the_paper_s_arm(spec):
     assert small.largest_payload_kg == pytest.approx((sum(small.arm_kg) + small.gripper_kg) / 4.7)
 
 
-def test_another_number_of_sections_needs_no_new_scalars(spec):
-    assert spec.replace(structure={"n_sections": 2}).n_chambers == 6
-    beta = {"beta": [0.93] * 9}
-    text = message_of(spec.replace(sensor=beta).replace, structure={"n_sections": 2})
-    assert text == "replace: sensor.beta: got 9 numbers, expected one, or one for each of the 6 springs"
-
-
 REFUSED = [
     # field, value, what follows the field in the message
     ("mass.gripper_length_m", "heavy", "got 'heavy', expected a number > 0 and <= 2 (m, not mm)"),
@@ -63,6 +56,8 @@ REFUSED = [
     ("backbone.axial_stiffness_n_per_m", math.nan, "got nan, expected a number > 0"),
     ("backbone.axial_stiffness_n_per_m", 1e39, "got 1e+39, expected sizes from"),
     ("structure.n_sections", 3.0, "got 3.0, expected a whole number >= 1"),
+    ("structure.springs_per_section", 2, "got 2, expected 0 for one beside each chamber, or 3 or more"),
+    ("structure.springs_per_section", 4, "got 4, expected 0 for one beside each chamber, or 3 or more"),
     ("mounting.base_turn_deg", [1.0], "got [1.0], expected a list of 3 numbers"),
     ("chambers.pressure_min_kpa", 20.0, "got 20.0, expected less than pressure_max_kpa (20.0)"),
     ("springs.rest_length_m", 0.7, "got 0.7 with geometry.section_length_m 0.2, expected lengths that go"),
@@ -90,12 +85,6 @@ def test_a_missing_field_a_missing_group_and_an_unknown_one_are_named(spec, data
     del data["mass"]
     assert message_of(ArmSpec.from_dict, data, "my.toml").startswith("my.toml: mass: got nothing")
     assert message_of(spec.replace, motors={}).startswith("replace: got unknown group 'motors'")
-
-
-@pytest.mark.parametrize("chambers, springs", [(4, 3), (6, 12)])
-def test_springs_stand_beside_chambers(spec, chambers, springs):
-    counts = {"chambers_per_section": chambers, "springs_per_section": springs}
-    assert f"structure.springs_per_section: got {springs}, " in message_of(spec.replace, structure=counts)
 
 
 def test_sections_may_differ_and_have_fewer_springs_than_chambers(spec):
