@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -220,11 +221,11 @@ class ArmSpec:
 
     def pneumatics(self, length_m: np.ndarray, timestep_s: float) -> Pneumatics:
         """Return the air of chambers with lengths (n_chambers,) [m] at the start, stepped by `timestep_s`."""
-        area_m2, slope_m = map(self.per_chamber, (self.chambers.area_m2, self.chambers.area_slope_m))
+        area = self.chambers.area_m2, self.chambers.area_slope_m
+        area_m2, slope_m = (np.array(self.per_chamber(value)) for value in area)
         rest_m = self.at_chambers(self.geometry.section_length_m)
-        actuators = self.actuators
-        bellows = np.array(area_m2), np.array(slope_m), rest_m
-        return Pneumatics(*bellows, length_m, timestep_s, actuators.per_chamber(self.n_chambers))
+        actuators = self.actuators.per_chamber(self.n_chambers)
+        return Pneumatics(area_m2, slope_m, rest_m, length_m, timestep_s, actuators)
 
     def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
         """Return one number per chamber, from a field with one number or one per chamber."""
@@ -314,7 +315,11 @@ class ArmSpec:
             SpecError: a field is missing, unknown, of the wrong type or out of range.
         """
         spec = cls(**read_fields(cls, data, f"{source}: "))
-        spec._check_together(source)
+        n_sections = spec.structure.n_sections
+        counts = {"sections": n_sections, "chambers": spec.n_chambers, "springs": spec.n_springs}
+        check_counts(spec, counts, f"{source}: ")
+        for contradiction in spec._contradictions():
+            raise SpecError(f"{source}: {contradiction}")
         return spec
 
     def to_dict(self) -> dict[str, Any]:
@@ -346,31 +351,22 @@ class ArmSpec:
             data[group] = values
         return self.from_dict(data, "replace")
 
-    def _check_together(self, source: str) -> None:
-        """Refuse fields that contradict each other."""
+    def _contradictions(self) -> Iterator[str]:
+        """Yield what is wrong about fields that are valid by themselves, but not together."""
         # Each spring stands beside a chamber
-        structure = self.structure
-        n, springs = structure.chambers_per_section, structure.springs_per_section
+        n, springs = self.structure.chambers_per_section, self.structure.springs_per_section
         if springs and (springs < LEAST_CHAMBERS or n % springs):
-            raise SpecError(
-                f"{source}: structure.springs_per_section: got {springs}, expected 0 for one beside each "
-                f"chamber, or {LEAST_CHAMBERS} or more that divide the {n} chambers"
+            yield (
+                f"structure.springs_per_section: got {springs}, expected 0 for one beside each chamber, "
+                f"or {LEAST_CHAMBERS} or more that divide the {n} chambers"
             )
-
-        # Lists have the right number of entries
-        counts = {
-            "sections": structure.n_sections,
-            "chambers": self.n_chambers,
-            "springs": self.n_springs,
-        }
-        check_counts(self, counts, f"{source}: ")
 
         # A negative bond leaves the backbone some stiffness
         backbone = self.backbone.axial_stiffness_n_per_m, self.backbone.bending_stiffness_nm_per_rad
         for stiffness, bonded in zip(map(self.per_section, backbone), self._bonded(), strict=True):
             if not np.all(np.add(stiffness, bonded) > 0.0):
-                raise SpecError(
-                    f"{source}: chambers.bonded_share: got {self.chambers.bonded_share!r}, which takes more "
+                yield (
+                    f"chambers.bonded_share: got {self.chambers.bonded_share!r}, which takes more "
                     "stiffness than the backbone has, expected a share closer to 0"
                 )
 
@@ -382,9 +378,7 @@ class ArmSpec:
         ):
             least, greatest = (getattr(getattr(self, group), name) for name in (low, high))
             if not np.all(np.less(least, greatest)):
-                raise SpecError(
-                    f"{source}: {group}.{low}: got {least!r}, expected less than {high} ({greatest!r})"
-                )
+                yield f"{group}.{low}: got {least!r}, expected less than {high} ({greatest!r})"
 
         # Springs have about the length of their sections
         section_m = self.geometry.section_length_m
@@ -397,9 +391,7 @@ class ArmSpec:
             ratio = np.divide(self.per_section(length_m), self.per_section(section_m))
             if not np.all((low <= ratio) & (ratio <= high)):
                 beside = f"with geometry.section_length_m {section_m!r}"
-                raise SpecError(
-                    f"{source}: springs.{name}: got {length_m!r} {beside}, expected lengths that go together"
-                )
+                yield f"springs.{name}: got {length_m!r} {beside}, expected lengths that go together"
 
         # The sensor can read every length that may be commanded
         sensor = self.spring_sensor
@@ -408,7 +400,6 @@ class ArmSpec:
             length_m = getattr(self.springs, name)
             readings = sensor.readings(self.at_springs(length_m))
             if not (readable := (readings >= low) & (readings <= high)).all():
-                raise SpecError(
-                    f"{source}: springs.{name}: got {length_m!r}, which reads {readings[~readable][0]:.6g} "
-                    f"{unit}, expected sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
-                )
+                expected = f"sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
+                unreadable = f"{readings[~readable][0]:.6g} {unit}"
+                yield f"springs.{name}: got {length_m!r}, which reads {unreadable}, expected {expected}"

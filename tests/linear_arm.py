@@ -165,7 +165,6 @@ def changed(estimator, change, factors=(), sections=slice(None)):
 def make_policy(spec=SPEC):
     """A policy whose estimator and spring model are exact for the linear arm; its actor is not looked at."""
     n, n_sections = spec.n_springs, spec.structure.n_sections
-    springs, chambers = np.zeros(n, np.float32), np.zeros(spec.n_chambers, np.float32)
     rest_m, gain = spec.at_springs(spec.geometry.section_length_m), gain_of(spec)
     first_rad = np.radians(spec.per_section(spec.geometry.first_chamber_deg))
     angle = first_rad[:, None] + 2 * np.pi * np.arange(n // n_sections) * n_sections / n
@@ -174,15 +173,15 @@ def make_policy(spec=SPEC):
     network = even_estimator(site_m)
     load = load_estimator_of(spec, np.full(spec.n_chambers, 1e5))  # no pressure counts as a payload
     model = SpringModel(
-        layers=((gain.T.astype(np.float32), springs),),
-        pressure_centre_kpa=chambers,
-        pressure_scale_kpa=chambers + 1,
-        spring_centre_m=rest_m.astype(np.float32),
-        spring_scale_m=springs + 1,
+        layers=((gain.T, np.zeros(n)),),
+        pressure_centre_kpa=np.zeros(spec.n_chambers),
+        pressure_scale_kpa=np.ones(spec.n_chambers),
+        spring_centre_m=rest_m,
+        spring_scale_m=np.ones(n),
     )
     rng = np.random.default_rng(1)
     return Policy(
-        layers=((np.zeros((18, n), np.float32), springs),),
+        layers=((np.zeros((18, n), np.float32), np.zeros(n, np.float32)),),
         obs_scale=ObsScale(*(np.asarray(value, float) for value in ObsScale.from_spec(spec))),
         reward=RewardConfig(),
         actions=ActionMap.from_spec(spec),
@@ -192,7 +191,7 @@ def make_policy(spec=SPEC):
         workspace=estimate(network, rest_m + rng.uniform(-30, 15, (2000, spec.n_chambers)) @ gain.T, 0.0),
         estimator=network,
         load_estimator=load,
-        spring_model=model,
+        spring_model=jax.tree.map(np.float32, model),
         s2r=None,
         provenance={},
     )

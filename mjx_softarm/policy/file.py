@@ -47,7 +47,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm._support import archive
-from mjx_softarm._support.archive import Entries, SealedFileError, entries_of
+from mjx_softarm._support.archive import Entries, entries_of
 from mjx_softarm._support.mlp import ACTIVATIONS, Activation, Layer
 from mjx_softarm.control import TOLERANCE_M, Gains, allocation
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
@@ -57,7 +57,7 @@ from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estim
 from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor
-from mjx_softarm.spec import ArmSpec, Mounting, SpecError
+from mjx_softarm.spec import ArmSpec, Mounting
 
 SCHEMA_VERSION = 17
 KIND = "policy"
@@ -192,6 +192,7 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises:
         SealedFileError: the file is no policy of this version, is damaged, or has a wrong entry.
+        SpecError: the arm in it is none.
     """
     return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
 
@@ -228,12 +229,6 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
-def _take_reward(entries: Entries) -> RewardConfig:
-    names = [item.name for item in dataclasses.fields(RewardConfig) if item.name != "axes"]
-    numbers = {name: entries.take(f"reward.{name}", np.float64, ()) for name in names}
-    return RewardConfig(**numbers, axes=tuple(entries.take("reward.axes", np.float64, (6,)).tolist()))
-
-
 def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadEstimator, SpringModel]:
     """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries."""
     n_sections = spec.structure.n_sections
@@ -252,10 +247,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     if version != SCHEMA_VERSION:
         expected = f"expected {SCHEMA_VERSION}: export the run again, or train it anew"
         entries.fail("schema_version", f"got {version}, {expected}")
-    try:
-        spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
-    except SpecError as error:
-        raise SealedFileError(str(error)) from error
+    spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
     # Take every entry with its type and shape.
     n = spec.n_springs
     observation = entries.one_of("observation", tuple(layouts(spec)))
@@ -263,11 +255,12 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     entries.names("obs_layout", obs_layout)
     entries.names("action_layout", action_layout(spec))
     s2r_kind = entries.one_of("s2r_kind", ("mlp", "none"))
+    reward = entries.group("reward", RewardConfig, (), (6,))
     estimator, load_estimator, spring_model = take_networks(entries, spec)
     policy = Policy(
         layers=entries.layers("actor", len(obs_layout), n),
         obs_scale=entries.group("obs_scale", ObsScale, (6,)),
-        reward=_take_reward(entries),
+        reward=dataclasses.replace(reward, axes=tuple(reward.axes.tolist())),
         actions=ActionMap(
             entries.group("sensor", type(spec.sensor), (), (n,)),
             *(entries.take(f"action.{name}", np.float64, (n,)) for name in ("low", "high")),

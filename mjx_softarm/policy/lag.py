@@ -55,7 +55,6 @@ def law_lag_s(
     moved on by them. Modes that chambers do not move have no lag.
 
     Args:
-        gains: numbers of the law.
         springs: from pressures (2, n_chambers, n_chambers) [kPa] to lengths (2, n_chambers, n_springs) [m].
         pressure_kpa (n_chambers,) [kPa]: pressures, around which G is taken, also beyond the limits.
     """

@@ -53,8 +53,7 @@ class Reachable(NamedTuple):
         position, flat = _weighted(reward, pose)
         poses = cls(pose, position, flat, reward, 0.0)
         nearest = []
-        for start in range(0, len(pose), _CHUNK):
-            rows = np.arange(start, min(start + _CHUNK, len(pose)))
+        for rows in np.split(np.arange(len(pose)), range(_CHUNK, len(pose), _CHUNK)):
             distance = _distances(poses, poses.position[rows], flat[rows])  # (rows, m)
             distance[np.arange(len(rows)), rows] = np.inf
             nearest.append(distance.min(axis=1))
@@ -126,9 +125,10 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     xp = array_namespace(goal, search)
     n = policy.spec.n_chambers
     share, damping = search[:, :n], search[:, n]
-    target = _target(policy, goal, len(share))  # (rows, f)
-    error = _features_at(policy, share) - target
-    beside = _features_at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, f)
+    target = _target(policy, goal)  # (rows, f)
+    error = _features(policy, *_tip(policy, share)) - target
+    beside = _features(policy, *_tip(policy, share[:, None] + _DIFFERENCE * np.eye(n)))  # (rows, n, f)
+    beside = beside - target[:, None]
     slope = (beside - error[:, None]) / _DIFFERENCE
     gradient = xp.sum(slope * error[:, None], axis=-1)  # (rows, n)
     # Pressures at a limit that would leave their range do not move.
@@ -137,7 +137,8 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     # Take the step where it helps; else only raise the damping.
     curvature = slope @ xp.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
     tried = xp.clip(share - solve(curvature, gradient), 0.0, 1.0)
-    helped = xp.sum((_features_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
+    left = _features(policy, *_tip(policy, tried)) - target
+    helped = xp.sum(left**2, axis=-1) < xp.sum(error**2, axis=-1)
     damping = xp.clip(damping * xp.where(helped, _EASE, _STIFFEN), _LEAST_DAMPING, _MOST_DAMPING)
     return xp.concat([xp.where(helped[:, None], tried, share), damping[:, None]], axis=1)
 
@@ -146,9 +147,10 @@ def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array
     """Return a search's nearest poses (k, 6) [mm, deg] to goals (k, 6), and their weighted errors (k,)."""
     xp = array_namespace(goal, search)
     share = search[:, : policy.spec.n_chambers]
-    error = _features_at(policy, share) - _target(policy, goal, len(share))
+    tip = _tip(policy, share)
+    error = _features(policy, *tip) - _target(policy, goal)
     square = xp.sum(error**2, axis=-1).reshape(-1, N_STARTS)
-    pose = pose_from_frame(*_tip(policy, share)).reshape(-1, N_STARTS, 6)
+    pose = pose_from_frame(*tip).reshape(-1, N_STARTS, 6)
     best, least = pose[:, 0], square[:, 0]
     for start in range(1, N_STARTS):
         better = square[:, start] < least
@@ -167,14 +169,9 @@ def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
     return corrected(policy.s2r, frame, spring_m)
 
 
-def _features_at(policy: Policy, share: Array) -> Array:
-    """Return the `_features` (..., f) of the tip at shares (..., n) of the range of pressures."""
-    return _features(policy, *_tip(policy, share))
-
-
-def _target(policy: Policy, goal: Array, n_rows: int) -> Array:
-    """Return the `_features` (n_rows, f) of goals (k, 6), each repeated for n_rows / k rows."""
-    return _features(policy, *frame_from_pose(goal))[np.arange(n_rows) * len(goal) // n_rows]
+def _target(policy: Policy, goal: Array) -> Array:
+    """Return the `_features` (k * N_STARTS, f) of goals (k, 6), each repeated for its starts."""
+    return _features(policy, *frame_from_pose(goal))[np.repeat(np.arange(len(goal)), N_STARTS)]
 
 
 def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
@@ -201,7 +198,6 @@ def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array
         mean_m (n_springs,) [m]: lengths at rest on the last references.
         asked_m (n_springs,) [m]: the last references.
         saturated (n_chambers,): bool.
-        policy: the arm.
     """
     # Motion and error of each chamber
     xp = array_namespace(reference_m, mean_m)

@@ -54,7 +54,6 @@ def sensed(
     """Return the entries (k,) that a policy observes besides pose and goal, float32; None if there are none.
 
     Args:
-        policy: policy of any kind of observation.
         pose (6,) [mm, deg]: tip pose, as `tip_pose` gives it.
         spring_m (n,) [m]: spring lengths.
         motion: used by policies that observe motion.
@@ -120,19 +119,17 @@ class PolicyRunner:
         """Return the action (..., n) in [-1, 1], float32; arguments as for `act`.
 
         Raises:
-            ValueError: pose or goal has a wrong shape or is not finite, the actor overflows, or `sensed` is
-                missing, not observed, or has a wrong shape.
+            ValueError: pose, goal or `sensed` has a wrong shape, a pose or goal is not finite, or the actor
+                overflows.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
         n_more = len(self.policy.obs_layout) - OBS_SIZE
-        if (None if sensed is None else np.shape(sensed)[-1:]) != ((n_more,) if n_more else None):
-            came = "None" if sensed is None else f"shape {np.shape(sensed)}"
-            expected = f"(..., {n_more})" if n_more else "None"
-            kind = self.policy.observation
-            raise ValueError(f"sensed: got {came}, expected {expected}: the policy observes the {kind}")
-        if sensed is not None:
-            sensed = np.broadcast_to(np.asarray(sensed, np.float32), (*pose.shape[:-1], n_more))
-        action = action_towards(self.policy, pose, goal, sensed)
+        entries = np.asarray([] if sensed is None else sensed, np.float32)
+        if entries.shape[-1:] != (n_more,):
+            expected = f"(..., {n_more}): the policy observes the {self.policy.observation}"
+            raise ValueError(f"sensed: got shape {entries.shape}, expected {expected}")
+        entries = np.broadcast_to(entries, (*pose.shape[:-1], n_more))
+        action = action_towards(self.policy, pose, goal, entries)
         if not np.isfinite(action).all():
             raise ValueError("action: got nan, expected finite numbers; the actor overflows")
         return action

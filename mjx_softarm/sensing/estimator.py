@@ -8,6 +8,7 @@ depend on the sections above and below, so several passes are made.
 
 from __future__ import annotations
 
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
@@ -95,7 +96,7 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     plate = chain(sections)
     tip_m = plate.position_m + plate.rotation @ estimator.tip_offset_m
     tip = Frame(tip_m, plate.rotation @ estimator.tip_rotation)
-    return _from_base(Frame(estimator.base_position_m, estimator.base_rotation), tip)
+    return compose(Frame(estimator.base_position_m, estimator.base_rotation), tip)
 
 
 def _change(estimator: PoseEstimator, x: Array) -> Array:
@@ -125,7 +126,6 @@ def first_moments(estimator: PoseEstimator, length: Array, sections: Frame, load
     They are about the section's end, in its axes.
 
     Args:
-        estimator: masses of the arm.
         length (..., n_sections, 1) [m]: lengths of the sections.
         sections: each section's end in the frame of its start, (..., n_sections).
         load_kg (..., 1) [kg]: payload.
@@ -152,10 +152,10 @@ def variables(
     """Return what the change of a section's end depends on, (..., N_VARIABLES).
 
     These are its shape, the direction against gravity, the torque of gravity on the masses below, over its
-    acceleration, and the payload. No variable depends on the change itself.
+    acceleration, and the payload.
 
     Args:
-        length, bend: of the section, (..., 1) [m] and (..., 2) [rad]; all sections may stand in "...".
+        length (..., 1) [m], bend (..., 2) [rad]: of the section.
         even_rotation (..., 3, 3): axes of its end in those of its start, of constant curvature.
         up (..., 3): direction against gravity in the axes of the section's start.
         moment (..., 3) [kg m]: of the masses below, see `first_moments`.
@@ -179,18 +179,14 @@ def polynomial_terms(x: Array) -> Array:
 def _products() -> list[tuple[np.ndarray, np.ndarray]]:
     """Return, for products of 1, 2, ... factors, the product of one factor less and the last factor."""
     levels = list[tuple[np.ndarray, np.ndarray]]()
-    products = [(0,)]  # numbers of the variables; the first product is 1, and any variable may follow
-    while True:
-        longer = [
-            (place, (*product, factor))
-            for place, product in enumerate(products)
-            for factor in range(product[-1], N_VARIABLES)
-            if sum(_COSTS[k] for k in (*product[1:], factor)) <= _DEGREE
-        ]
-        if not longer:
-            return levels
-        parents, products = [place for place, _ in longer], [product for _, product in longer]
+    shorter: dict[tuple[int, ...], int] = {(): 0}  # places of products, as numbers of their variables
+    for n_factors in range(1, _DEGREE + 1):
+        products = combinations_with_replacement(range(N_VARIABLES), n_factors)
+        products = [product for product in products if sum(_COSTS[k] for k in product) <= _DEGREE]
+        parents = [shorter[product[:-1]] for product in products]
         levels.append((np.array(parents), np.array([product[-1] for product in products])))
+        shorter = {product: place for place, product in enumerate(products)}
+    return levels
 
 
 N_VARIABLES = len(_COSTS)
@@ -200,13 +196,13 @@ N_TERMS = 1 + sum(len(factors) for _, factors in _PRODUCTS)
 
 def even_pose(base: Frame, spring_site_m: Array, spring_m: Array) -> Array:
     """Return the tip pose (..., 6) [mm, deg] with sections that bend evenly; arguments as of `backbone`."""
-    return pose_from_frame(*_from_base(base, chain(constant_curvature(spring_site_m, spring_m))))
+    return pose_from_frame(*compose(base, chain(constant_curvature(spring_site_m, spring_m))))
 
 
-def _from_base(base: Frame, tip: Frame) -> Frame:
-    """Return a frame in the axes of the arm's own base in the base frame."""
-    position_m = (base.rotation @ tip.position_m[..., None])[..., 0] + base.position_m
-    return Frame(position_m, base.rotation @ tip.rotation)
+def compose(outer: Frame, inner: Frame) -> Frame:
+    """Return the frame `inner`, which is given in the axes of `outer`, in those of `outer`'s own frame."""
+    position_m = (outer.rotation @ inner.position_m[..., None])[..., 0] + outer.position_m
+    return Frame(position_m, outer.rotation @ inner.rotation)
 
 
 def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
@@ -255,12 +251,13 @@ def arcs(length: Array, bend: Array) -> Frame:
 
 def chain(sections: Frame) -> Frame:
     """Return the frame of the last plate in the axes of the base, of sections (..., n_sections) in series."""
-    position_m, rotation = sections.position_m[..., -1, :, None], sections.rotation[..., -1, :, :]
-    for section in reversed(range(sections.position_m.shape[-2] - 1)):  # from the tip up to the base
-        above = sections.rotation[..., section, :, :]
-        position_m = sections.position_m[..., section, :, None] + above @ position_m
-        rotation = above @ rotation
-    return Frame(position_m[..., 0], rotation)
+    *above, frame = (
+        Frame(sections.position_m[..., k, :], sections.rotation[..., k, :, :])
+        for k in range(sections.position_m.shape[-2])
+    )
+    for section in reversed(above):  # from the tip up to the base
+        frame = compose(section, frame)
+    return frame
 
 
 def backbone(
@@ -280,22 +277,19 @@ def backbone(
     """
     # Sections in series; a share of a section has the same share of its springs' lengths
     inner = constant_curvature(spring_site_m, at[:, None] * spring_m)  # (k, n_sections)
-    end = int(np.argmax(at))
-    frames, above_m, above = [], *base
+    last, frames, end = int(np.argmax(at)), [], base
     for section in range(inner.position_m.shape[1]):
-        position_m = above_m + inner.position_m[:, section] @ above.T
-        rotation = above @ inner.rotation[:, section]
-        frames.append((position_m, rotation))
-        above_m, above = position_m[end], rotation[end]
-    position_m, rotation = (np.stack(part) for part in zip(*frames, strict=True))  # (n_sections, k)
+        frames.append(compose(end, Frame(inner.position_m[:, section], inner.rotation[:, section])))
+        end = Frame(frames[-1].position_m[last], frames[-1].rotation[last])
+    position_m, rotation = map(np.stack, zip(*frames, strict=True))  # (n_sections, k)
     if not np.isfinite(tip).all():
         return Frame(position_m, rotation)
 
     # Spread the distance of the tip from their end
     tip_m, tip_rotation = frame_from_pose(np.asarray(tip, float))
     share = (np.arange(len(frames))[:, None] + at) / len(frames)  # share of the way to the tip
-    turn = share_of_turn(tip_rotation @ above.T, share)
-    return Frame(position_m + share[..., None] * (tip_m - above_m), turn @ rotation)
+    turn = share_of_turn(tip_rotation @ end.rotation.T, share)
+    return Frame(position_m + share[..., None] * (tip_m - end.position_m), turn @ rotation)
 
 
 def expected_springs(model: SpringModel, pressure_kpa: Array) -> Array:

@@ -70,7 +70,6 @@ def held_kpa(
     """Return the pressures (m, n_chambers) [kPa] that hold the real arm.
 
     Args:
-        held: process of the arm.
         spring_m (m, n_springs) [m]: spring lengths.
         light_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm there without a payload.
         effect_kpa (m, n_chambers) [kPa]: simulated change of these pressures by the arm's payload.
@@ -116,12 +115,9 @@ def residual(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray
 
 def covariances(held: HeldPressures, share: np.ndarray) -> np.ndarray:
     """Return covariances (m, s c, s c) [kPa^2] of residual pressures with variances (m, s) over V."""
-    m, s = share.shape
-    blocks = share[:, :, None, None] * held.covariance_kpa2
-    c = blocks.shape[-1]
-    matrices = np.zeros((m, s, c, s, c))
-    matrices[:, np.arange(s), :, np.arange(s)] = np.swapaxes(blocks, 0, 1)
-    return matrices.reshape(m, s * c, s * c)
+    s, c, _ = held.covariance_kpa2.shape
+    blocks = np.einsum("ms,st,sij->msitj", share, np.eye(s), held.covariance_kpa2)
+    return blocks.reshape(len(share), s * c, s * c)
 
 
 def save_pressures(path: Path, held: HeldPressures) -> None:

@@ -113,7 +113,6 @@ def estimate_load(
     The payload may lie below 0 or above `load_scale_kg`.
 
     Args:
-        estimator: network of the arm.
         spring_m (..., n_springs) [m]: spring lengths.
         pressure_kpa (..., n_chambers) [kPa]: pressures.
         stop (..., n_chambers): states of the chambers' hysteresis; 0 where the way to this pose is not known.

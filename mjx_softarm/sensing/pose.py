@@ -94,17 +94,13 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
     """Return the rotation vector (3,) [rad] of a rotation (3, 3); inverse of `rotation_about`."""
     w, *axis = quaternion_from_rotation(rotation)
     sine = np.linalg.norm(axis)
-    angle = 2.0 * np.arctan2(sine, abs(w)) * np.sign(w)
+    angle = 2.0 * np.arctan2(sine, abs(w)) * np.sign(w)  # the shorter way round
     return angle / max(sine, np.finfo(float).tiny) * np.array(axis)
 
 
 def share_of_turn(rotation: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Return shares (...,) of a turn (3, 3), about its own axis: matrices (..., 3, 3). NumPy only."""
-    w, *axis = quaternion_from_rotation(rotation)
-    sine = np.linalg.norm(axis)
-    half = np.asarray(share) * (np.arctan2(sine, abs(w)) * np.sign(w))  # the shorter way round
-    along = np.multiply.outer(np.sin(half), np.array(axis) / max(sine, np.finfo(float).tiny))
-    return rotation_from_quaternion(np.concatenate([np.cos(half)[..., None], along], axis=-1))
+    return rotation_about(np.multiply.outer(share, rotation_vector(rotation)))
 
 
 def pose_error(pose: Array, goal: Array) -> Array:

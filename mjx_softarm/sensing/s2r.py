@@ -90,11 +90,10 @@ def correction_between(pose: Array, real_pose: Array) -> Array:
     xp = array_namespace(pose, real_pose)
     (start_m, start), (end_m, end) = frame_from_pose(pose), frame_from_pose(real_pose)
     turn = end @ xp.swapaxes(start, -1, -2)
-    (_, r01, r02), (r10, _, r12), (r20, r21, _) = (
-        [turn[..., row, column] for column in range(3)] for row in range(3)
-    )
+    skew = turn - xp.swapaxes(turn, -1, -2)
+    axis = xp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
     size = 1.0 + xp.trace(turn, axis1=-2, axis2=-1)  # 4 cos(angle / 2)^2
-    gibbs = xp.stack([r21 - r12, r02 - r20, r10 - r01], axis=-1) / xp.maximum(size, 1e-6)[..., None]
+    gibbs = axis / xp.maximum(size, 1e-6)[..., None]
     return xp.concat([1000.0 * (end_m - start_m), gibbs], axis=-1)
 
 

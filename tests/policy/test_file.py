@@ -12,6 +12,7 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import archive
 from mjx_softarm._support.archive import SealedFileError, sealed
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import allocation
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.mdp.rewards import RewardConfig
@@ -67,7 +68,7 @@ def assert_same(one, other):
 
 def refusal(path):
     """The message with which a file is refused: one line that starts with the file's name."""
-    with pytest.raises(SealedFileError) as caught:
+    with pytest.raises(InputError) as caught:
         load_policy(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ") and "\n" not in message

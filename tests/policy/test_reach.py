@@ -35,15 +35,11 @@ def test_straight_arm_ends_where_its_limits_do(limit_kpa, sign, beyond_mm):
     assert (error > POLICY.reward.threshold) == (beyond_mm > 10.0)
 
 
-def test_turns_that_no_pressures_give_are_told():
+def test_a_turn_that_no_pressures_give_is_told_where_it_is_asked_for():
     turned = np.array([[0.0, 0.0, -600.0, 90.0, 0.0, 0.0]])  # an arm without torsion
     [near], [error] = nearest_poses(POLICY, turned)
     assert error > POLICY.reward.threshold and abs(near[3]) < 60.0
-
-
-def test_a_turn_that_is_not_asked_for_costs_nothing():
     policy = dataclasses.replace(POLICY, reward=RewardConfig(axes=(1.0, 1.0, 1.0, 0.0, 1.0, 1.0)))
-    turned = np.array([[0.0, 0.0, -600.0, 90.0, 0.0, 0.0]])
     [near], [error] = nearest_poses(policy, turned)
     assert error < 0.1 * policy.reward.threshold
     np.testing.assert_allclose(near[:3], [0.0, 0.0, -600.0], atol=0.6)

@@ -61,15 +61,13 @@ def test_rotation_survives_gimbal_lock_in_float32(pitch):
     assert np.max(angle_deg(np.float64(rotation), np.float64(back))) < 1e-3
 
 
-@pytest.mark.parametrize(
-    "angles", [(0, 90, 0), (0, -90, 0), (20, 90, 50), (180, 0, 0), (0, 0, 180), (0, 0, 0)]
-)
-def test_gradients_are_finite_everywhere(angles):
+def test_gradients_are_finite_everywhere():
+    angles = [(0, 90, 0), (0, -90, 0), (20, 90, 50), (180, 0, 0), (0, 0, 180), (0, 0, 0)]
     exact = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix().round(6)  # true zeros at the lock
-    rotation = jnp.asarray(np.float32(exact))
-    jacobian = jax.jacobian(pose_from_frame, argnums=1)(jnp.zeros(3), rotation)
+    of_rotation = jax.vmap(jax.jacobian(pose_from_frame, argnums=1))
+    jacobian = of_rotation(jnp.zeros((len(angles), 3)), jnp.asarray(np.float32(exact)))
     assert np.isfinite(jacobian).all()
-    assert np.any(jacobian[3]) == (abs(angles[1]) != 90)
+    assert np.any(jacobian[:, 3], axis=(1, 2)).tolist() == [abs(pitch) != 90 for _, pitch, _ in angles]
 
 
 def test_gradient_equals_the_difference_quotient():
@@ -89,11 +87,6 @@ def test_pose_error_wraps_angles_only():
     np.testing.assert_allclose(pose_error(goal, pose)[3:], [2.0, -20.0, -180.0])
     turned = pose + [0.0, 0.0, 0.0, 360.0, -720.0, 1800.0]
     np.testing.assert_allclose(pose_error(turned, goal), pose_error(pose, goal))
-
-
-def test_pose_error_has_the_slope_of_a_difference():
-    slope = jax.grad(lambda p: pose_error(p, jnp.zeros(6)).sum())(jnp.full(6, 270.0))
-    np.testing.assert_array_equal(slope, 1.0)
 
 
 def test_jax_gives_numpy_s_poses():

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from mjx_softarm._support.archive import SealedFileError
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import (
-    S2R,
     apply_correction,
     carry_body,
     correct,
@@ -20,6 +19,7 @@ from mjx_softarm.sensing.s2r import (
     load_s2r,
     save_s2r,
 )
+from tests.networks import s2r_of
 
 RNG = np.random.default_rng(0)
 N_SPRINGS, N_IN = 9, 18
@@ -40,16 +40,13 @@ def springs(n, seed=0):
 def network():
     """A random network."""
     rng = np.random.default_rng(0)
-    sizes = (N_IN, 32, 32, 6)
-    layers = [
+    layers = tuple(
         (rng.normal(size=(n_in, n_out)) / np.sqrt(n_in), rng.normal(size=n_out))
-        for n_in, n_out in itertools.pairwise(sizes)
-    ]
-    bound = np.array([20.0, 20.0, 20.0, 0.2, 0.2, 0.2])
-    low = np.r_[-0.3 * np.ones(3), -np.ones(6), 0.1 * np.ones(N_SPRINGS)]
-    high = np.r_[0.3 * np.ones(3), np.ones(6), 0.25 * np.ones(N_SPRINGS)]
-    arrays = (low, high, -bound, bound, rng.uniform(-1.0, 1.0, (50, N_IN)), 0.5)
-    return jax.tree.map(np.float32, S2R(tuple(layers), *arrays))
+        for n_in, n_out in itertools.pairwise((N_IN, 32, 32, 6))
+    )
+    low, high = np.repeat([[-0.3, -1.0, 0.1], [0.3, 1.0, 0.25]], [3, 6, N_SPRINGS], axis=1)
+    inputs = {"input_low": low, "input_high": high, "anchors": rng.uniform(-1.0, 1.0, (50, N_IN))}
+    return jax.tree.map(np.float32, s2r_of(layers, np.repeat([20.0, 0.2], 3), **inputs, limit=0.5))
 
 
 def test_correction_is_a_shift_and_a_turn_in_the_base_frame():

@@ -39,30 +39,25 @@ def relative_error(got, expected):
 
 
 @pytest.mark.parametrize("compensation_h", COMPENSATIONS_H)
-def test_float64_follows_the_equations_both_ways(compensation_h):
+@pytest.mark.parametrize(
+    "dtype, batched, to_hz, to_m, both",
+    [
+        (np.float64, lambda f: f, 1e-14, 1e-13, 1e-13),
+        (np.float32, lambda f: f, 2e-6, 2e-6, 1e-6),
+        (np.float32, lambda f: jax.jit(jax.vmap(f)), 2e-6, 2e-6, 1e-6),
+    ],
+    ids=["numpy64", "numpy32", "jax32"],
+)
+def test_the_equations_hold_both_ways(compensation_h, dtype, batched, to_hz, to_m, both):
     spec = make_spec(compensation_h)
-    params = spec.spring_sensor
-    frequency = frequency_by_the_book(LENGTHS_M, spec)
-    assert relative_error(params.readings(LENGTHS_M), frequency) < 1e-14
-    reading = params.lengths(frequency)
-    assert not reading.lost.any()
-    assert relative_error(reading.length_m, LENGTHS_M) < 1e-13
-
-
-@pytest.mark.parametrize("compensation_h", COMPENSATIONS_H)
-@pytest.mark.parametrize("library", ["numpy", "jax"])
-def test_float32_keeps_its_precision(compensation_h, library):
-    spec = make_spec(compensation_h)
-    params = jax.tree.map(np.float32, spec.spring_sensor)
-    batched = {"numpy": lambda f: f, "jax": lambda f: jax.jit(jax.vmap(f))}[library]
-    to_frequency = batched(params.readings)
-    to_length = batched(lambda x: params.lengths(x).length_m)
-    lengths, book = np.float32(LENGTHS_M), frequency_by_the_book(LENGTHS_M, spec)
-    frequency = to_frequency(lengths)
-    assert frequency.dtype == to_length(frequency).dtype == np.float32
-    assert relative_error(frequency, book) < 2e-6
-    assert relative_error(to_length(np.float32(book)), LENGTHS_M) < 2e-6
-    assert relative_error(to_length(frequency), lengths.astype(np.float64)) < 1e-6
+    sensor = jax.tree.map(dtype, spec.spring_sensor)
+    lengths, book = LENGTHS_M.astype(dtype), frequency_by_the_book(LENGTHS_M, spec)
+    frequency, lengths_of = batched(sensor.readings)(lengths), batched(sensor.lengths)
+    reading, again = lengths_of(book.astype(dtype)), lengths_of(frequency)
+    assert frequency.dtype == reading.length_m.dtype == dtype and not np.any(reading.lost)
+    assert relative_error(frequency, book) < to_hz
+    assert relative_error(reading.length_m, LENGTHS_M) < to_m
+    assert relative_error(again.length_m, lengths.astype(np.float64)) < both
 
 
 @pytest.mark.parametrize("convert", [Sensor.lengths, jax.jit(Sensor.lengths)], ids=["numpy", "jax"])
