@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.control import Gains, allocated_error, at_chambers, saturated
-from mjx_softarm.deploy.controller import Command, Controller
+from mjx_softarm.control import Gains, LawState, allocated_error, at_chambers, saturated
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import ARRIVED_M, still
 from mjx_softarm.policy.runtime import tip_pose
@@ -25,6 +26,7 @@ from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.hysteresis import stop_after
 from mjx_softarm.sensing.load import KNOWN, Load, averaged, estimate_load, holds_payload
 from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import ArmSpec
 
 STUCK_RANGE_M = 1e-5  # range of a stuck sensor over a window; a live one's noise is larger
 STUCK_PRESSURE_KPA = 2.0  # range of its chamber's pressure at which a live one moves; by hand
@@ -37,6 +39,22 @@ NO_AIR_SHARE = 1.5  # share of all pressures from which the shape is not that wi
 EXPLAINED_SHARE = 0.7  # least share of the springs' squared deviations that this explains
 LOST_EFFECT_M = 0.01  # least change at the chamber; tolerances and payloads look like less
 _NO_EFFECT_M2 = 1e-18
+
+
+class Command(NamedTuple):
+    """References and pressures in force."""
+
+    reference_m: np.ndarray | None  # (n_springs,) None: the pressures go to zero
+    n_ticks: int  # ticks since the references or the goal were new
+    law: LawState  # NaN lengths before the first reading
+    pressure_kpa: np.ndarray  # (n_chambers,)
+
+    @classmethod
+    def none(cls, spec: ArmSpec) -> Command:
+        """Return the command of an arm without pressure."""
+        zero_kpa = np.zeros(spec.n_chambers)
+        unknown_m = np.full(spec.n_springs, np.nan)
+        return cls(None, 0, LawState.at_rest(zero_kpa, unknown_m), zero_kpa)
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,7 +225,7 @@ class _Session:
         # Take a tick of the loop.
         began = time.perf_counter()
         try:
-            self.state, events = step(self.controller, self.state, readings, self.late, row["pressure_kpa"])
+            self.state, events = step(self.state, readings, self.late, row["pressure_kpa"])
         except Exception:  # the row that explains it is kept
             self._log(row)
             raise
