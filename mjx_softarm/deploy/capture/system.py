@@ -1,8 +1,7 @@
-"""Motion capture systems: the option that names one, its frames, and checks of names."""
+"""Motion capture systems: the option that names one, its frames, and a check of names."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -59,13 +58,3 @@ def check_names(where: str, kind: str, asked: str, known: list[str]) -> None:
     """Refuse a body or a marker set, by an InputError, that the system does not have."""
     if asked and asked not in known:
         raise InputError(f"{where}: got no {kind} {asked!r}, expected one of {', '.join(known) or 'some'}")
-
-
-def numbered(prefix: str, labels: list[str]) -> list[int]:
-    """Return the places of the labels PREFIX0, PREFIX1, ..., in the order of their numbers."""
-    places = {
-        int(label[len(prefix) :]): k
-        for k, label in enumerate(labels)
-        if re.fullmatch(re.escape(prefix) + r"\d+", label)
-    }
-    return [places[number] for number in sorted(places)]

@@ -154,12 +154,11 @@ def message(kind, data):
 class QualisysServer(Server):
     """QTM: TCP, little-endian, millimetres, matrices column by column, NaN for what is not seen."""
 
-    def __init__(self, scene, port=0):
+    def __init__(self, scene):
         super().__init__(scene)
-        self.listener = socket.create_server(("127.0.0.1", port))
+        self.listener = socket.create_server(("127.0.0.1", 0))
         self.listener.settimeout(0.01)
         self.port, self.client, self.streams = self.listener.getsockname()[1], None, False
-        self.n_accepted, self.n_dropped, self.refuses = 0, 0, ""
 
     def serve(self):
         with self.listener:
@@ -178,7 +177,6 @@ class QualisysServer(Server):
             self.client = self.listener.accept()[0]
         except TimeoutError:
             return
-        self.n_accepted += 1
         self.client.settimeout(1.0)
         self.send(1, b"QTM RT Interface connected\0")
 
@@ -194,7 +192,7 @@ class QualisysServer(Server):
 
     def drop(self):
         self.client.close()
-        self.client, self.streams, self.n_dropped = None, False, self.n_dropped + 1
+        self.client, self.streams = None, False
 
     def answer(self):
         self.client.setblocking(False)
@@ -214,9 +212,7 @@ class QualisysServer(Server):
             data = data[size:]
 
     def command(self, text):
-        if self.refuses and text.startswith(self.refuses):
-            self.send(0, b"Parse error\0")
-        elif text.startswith("version"):
+        if text.startswith("version"):
             self.send(1, b"Version set to " + text.split()[1].encode() + b"\0")
         elif text.startswith("getparameters"):
             bodies = "".join(f"<Body><Name>{name}</Name></Body>" for name in self.scene.bodies)
