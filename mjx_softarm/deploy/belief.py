@@ -107,7 +107,10 @@ class Belief:
     @cached_property
     def _tip(self) -> tuple[np.ndarray, float]:
         # Only when asked for: in most ticks after the pressures are written, for the log.
-        return pose_of(self.controller, self.spring_m, self.load)
+        if not self.known:
+            return np.full(6, np.nan), 0.0
+        pose, away = tip_pose(self.controller.policy, self.spring_m, self.load.believed_kg)
+        return pose, float(away)
 
     @property
     def lost(self) -> np.ndarray:
@@ -232,15 +235,9 @@ def hysteresis_after(policy: Policy, stop: Array, last_m: Array, spring_m: Array
     return stop_after(stop, moved_m, policy.load_estimator.stroke_m)
 
 
-def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
-    """Return the tip pose (6,) [mm, deg] of springs (n_springs,) [m] with a payload, NaN where a length is.
-
-    Beside it stands `s2r.extrapolation` of the pose, 0 without a network.
-    """
-    if np.isnan(spring_m).any():
-        return np.full(6, np.nan), 0.0
-    pose, away = tip_pose(controller.policy, spring_m, load.believed_kg)
-    return pose, float(away)
+def pose_of(policy: Policy, spring_m: np.ndarray, load: Load) -> np.ndarray:
+    """Return the tip pose (6,) [mm, deg] of springs (n_springs,) [m] with a payload."""
+    return np.asarray(tip_pose(policy, spring_m, load.believed_kg)[0], float)
 
 
 def read_lengths(

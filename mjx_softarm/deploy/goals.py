@@ -83,41 +83,36 @@ class ListedGoals:
 
     def __init__(
         self,
-        controller: Controller,
+        policy: Policy,
         goals: Iterable[np.ndarray],
         duration_s: float = np.inf,
         stay: bool = False,
     ):
-        self._controller = controller
         self._goals = list(goals)
-        self._refused = refusals(controller.policy, self._goals)  # now: it takes longer than a tick
+        self._refused = refusals(policy, self._goals)  # now: it takes longer than a tick
         self._duration_s = duration_s
         self._stays = stay
         self._began_s = np.nan
-        self._accepted = False
         self.n_goals = len(self._goals)
         self.n_taken = 0
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
-        """Go on to the next accepted goal where there is none; end after the last one, or the duration.
+        """Return the state with the goal of this tick, None once the run is over; and refusals of goals.
 
         Args:
             state: after the last tick.
             now_s: time.
             row: of the log, in this tick.
-
-        Returns:
-            The state with the goal of this tick, None where the run is over; refusals of goals.
         """
         if np.isnan(self._began_s):
             self._began_s = now_s
-        state, events = self.take_next(state)
+        state, events = self._with_next(state)
         ended = state.goal is None and self.n_taken == len(self._goals)
-        over = ended and not (self._stays and self._accepted)
-        over |= now_s - self._began_s >= self._duration_s
+        stays = self._stays and state.command.reference_m is not None
+        over = (ended and not stays) or now_s - self._began_s >= self._duration_s
         return None if over else state, events
 
-    def take_next(self, state: LoopState) -> tuple[LoopState, Events]:
+    def _with_next(self, state: LoopState) -> tuple[LoopState, Events]:
         """Return the state with the next accepted goal, if it has none, and the refusals until then."""
         refused: Events = ()
         while state.goal is None and self.n_taken < len(self._goals):
@@ -126,7 +121,6 @@ class ListedGoals:
                 refused += (self._refused[self.n_taken],)
             else:
                 state, events = with_goal(state, goal)
-                self._accepted |= not events
                 refused += events
             self.n_taken += 1
         return state, refused
@@ -135,8 +129,8 @@ class ListedGoals:
 class OrderedGoals(ListedGoals):
     """Goals that somebody orders; they are not counted, and only an exception of `orders` ends the run."""
 
-    def __init__(self, controller: Controller, orders: Callable[[], Order]):
-        super().__init__(controller, ())
+    def __init__(self, policy: Policy, orders: Callable[[], Order]):
+        super().__init__(policy, ())
         self._orders = orders
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
@@ -150,7 +144,7 @@ class OrderedGoals(ListedGoals):
             self._goals = list(order)
             self.n_taken = 0
             state = state._replace(goal=None)
-        return self.take_next(state)
+        return self._with_next(state)
 
 
 class MovingGoal:

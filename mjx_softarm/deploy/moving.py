@@ -147,9 +147,8 @@ class Predicting(NamedTuple):
         goal = goal + self.behind + way.correction
         for _ in range(policy.n_actions):
             length_m = planned(belief, pose, goal + shift)
-            pose, _ = pose_of(controller, length_m, belief.load)
-            left = asked_error(np.asarray(pose, float), goal, policy.reward)
-            shift = clipped(shift - left)
+            pose = pose_of(policy, length_m, belief.load)
+            shift = clipped(shift - asked_error(pose, goal, policy.reward))
         shape, behind = self.shape.advance(policy, length_m, belief.load.believed_kg, controller.dt_s)
 
         # Lengths due now, their rate, and the lag of springs that move so

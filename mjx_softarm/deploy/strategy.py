@@ -178,7 +178,7 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
     best_m = belief.spring_m
     for _ in range(1 + N_CORRECTIONS):
         reference_m = controller.plan(belief.pose, goal + shift, belief.spring_m, seen)
-        pose = np.asarray(pose_of(controller, reference_m, belief.load)[0], float)
+        pose = pose_of(policy, reference_m, belief.load)
         error = float(weighted_error(pose, goal, policy.reward))
         if error < least:
             least, best_m = error, reference_m
@@ -189,11 +189,11 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
 
 def _pose_made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     """Return the pose (6,) [mm, deg] of an arm at rest on its last references, moved to others."""
-    asked_m = belief.command.reference_m
     policy = belief.controller.policy
+    asked_m = belief.command.reference_m
     assert asked_m is not None
     spring_m = followed(reference_m, belief.mean_m, asked_m, belief.saturated, policy)
-    return np.asarray(pose_of(belief.controller, spring_m, load)[0], float)
+    return pose_of(policy, spring_m, load)
 
 
 def clipped(shift: np.ndarray) -> np.ndarray:
