@@ -235,9 +235,9 @@ def hysteresis_after(policy: Policy, stop: Array, last_m: Array, spring_m: Array
     return stop_after(stop, moved_m, policy.load_estimator.stroke_m)
 
 
-def pose_of(policy: Policy, spring_m: np.ndarray, load: Load) -> np.ndarray:
+def pose_of(policy: Policy, spring_m: np.ndarray, load_kg: float) -> np.ndarray:
     """Return the tip pose (6,) [mm, deg] of springs (n_springs,) [m] with a payload."""
-    return np.asarray(tip_pose(policy, spring_m, load.believed_kg)[0], float)
+    return np.asarray(tip_pose(policy, spring_m, load_kg)[0], float)
 
 
 def read_lengths(

@@ -15,7 +15,7 @@ from mjx_softarm.policy.runtime import PolicyRunner
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A policy made ready for the loop."""
+    """A policy, and what the loop computes of it once."""
 
     policy: Policy
     reachable: Reachable

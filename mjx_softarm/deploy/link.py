@@ -1,10 +1,8 @@
 """One arm behind its driver: guarded calls, the pressures in force, time, and the ramp to zero.
 
-Users write drivers, so any method may raise anything. Each call here names the method that failed, checks the
-answer, and keeps the pressures that the arm has taken.
-
-A simulated arm has a clock of its own, `time_s`, which advances as pressures are written: a run is as fast as
-the computer. A real arm has none: the loop waits for each tick.
+Users write drivers, so any method may raise anything: each call names the method that failed, and checks its
+answer. A simulated arm has a clock of its own, `time_s`, which advances as pressures are written: a run is as
+fast as the computer. For a real arm the loop waits for each tick.
 """
 
 from __future__ import annotations
@@ -44,10 +42,7 @@ class ArmFault(Exception):
 
 
 class Link:
-    """An arm without pressure at first, and a control loop of a period `dt_s`.
-
-    The driver's `pressures`, `motion_capture` and `time_s` are used if it has them.
-    """
+    """An arm without pressure at first, and a control loop of a period `dt_s`."""
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, dt_s: float):
         self._arm: Any = arm
@@ -55,7 +50,8 @@ class Link:
         self._dt_s = dt_s
         self._n_late = 0
         self._simulated = hasattr(arm, "time_s")
-        self.measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
+        self.measures = hasattr(arm, "pressures")
+        self.sees = hasattr(arm, "motion_capture")
         # Shapes of logged arrays; the first frame gives the shape of the markers.
         self._shapes: dict[str, tuple[int, ...]] = {"tip_m": (3,), "tip_quaternion": (4,)}
         self._unsure = False  # the arm may have taken the last pressures, but has not confirmed them
@@ -104,10 +100,9 @@ class Link:
             self._call("write_pressures", lambda: self._arm.write_pressures(pressure_kpa))
         except TimeoutError as error:
             self._n_late += 1
-            most = 2 * LATE_TICKS
-            if self._n_late <= most:
+            if self._n_late <= 2 * LATE_TICKS:
                 return False
-            got = f"got {self._n_late} late in a row, expected {most} at most"
+            got = f"got {self._n_late} late in a row, expected {2 * LATE_TICKS} at most"
             raise ArmFault(f"write_pressures: {got}") from error
         self.pressure_kpa = pressure_kpa
         self._n_late = 0
@@ -115,9 +110,7 @@ class Link:
         return True
 
     def look(self, time_s: float) -> dict[str, Any]:
-        """Return a row of the log: time, pressures, and motion capture unless it missed a frame.
-
-        If the arm measures no pressures, the row has the commanded ones; otherwise it has both.
+        """Return a row of the log: time, pressures (measured if they are), motion capture unless it missed.
 
         Raises:
             ArmFault: a method failed, or the shape of an array changed.
@@ -149,8 +142,9 @@ class Link:
                 in_time, why = False, str(error)
             n_failed = 0 if in_time else n_failed + 1
             if n_failed == VENT_TRIES:
-                got = f"got {n_failed} failed writes in a row, expected fewer"
-                raise ArmFault(f"vent: {got}; the last: {why}")
+                raise ArmFault(
+                    f"vent: got {n_failed} failed writes in a row, expected fewer; the last: {why}"
+                )
             self.wait_until(begin_s + self._dt_s)
 
     def _frame(self) -> dict[str, np.ndarray]:

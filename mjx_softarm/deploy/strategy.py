@@ -178,7 +178,7 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
     best_m = belief.spring_m
     for _ in range(1 + N_CORRECTIONS):
         reference_m = controller.plan(belief.pose, goal + shift, belief.spring_m, seen)
-        pose = pose_of(policy, reference_m, belief.load)
+        pose = pose_of(policy, reference_m, belief.load.believed_kg)
         error = float(weighted_error(pose, goal, policy.reward))
         if error < least:
             least, best_m = error, reference_m
@@ -193,7 +193,7 @@ def _pose_made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarra
     asked_m = belief.command.reference_m
     assert asked_m is not None
     spring_m = followed(reference_m, belief.mean_m, asked_m, belief.saturated, policy)
-    return pose_of(policy, spring_m, load)
+    return pose_of(policy, spring_m, load.believed_kg)
 
 
 def clipped(shift: np.ndarray) -> np.ndarray:
