@@ -118,11 +118,6 @@ class Belief:
         return self.n_lost > 0
 
     @property
-    def suspect(self) -> np.ndarray:
-        """Chambers (n_chambers,), bool, that seem to have lost their pressure."""
-        return self.n_suspect > 0
-
-    @property
     def known(self) -> bool:
         """True once each spring has been read."""
         return not np.isnan(self.spring_m).any()
@@ -175,8 +170,9 @@ def believe(
 
     # Lengths, and the windows that end with them
     spring_m, lost, why = read_lengths(policy.sensor, readings, last.spring_m)
-    seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
-    chamber_kpa = np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
+    chamber_kpa = in_force_kpa
+    if measured_kpa is not None:
+        chamber_kpa = np.where(np.isfinite(measured_kpa), measured_kpa, in_force_kpa)
     belief = replace(
         last,
         command=command,
@@ -214,7 +210,7 @@ def _with_load(belief: Belief) -> Belief:
     An estimate whose interval holds no payload leaves the specified payload. One that is not known well
     changes nothing.
     """
-    doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
+    doubtful = belief.lost.any() or belief.stuck.any() or belief.n_suspect.any()
     if not belief.at_rest or belief.n_unweighed < belief.controller.window or doubtful:
         return belief
     model = belief.controller.policy.load_estimator
@@ -304,11 +300,9 @@ def explained_by_pressure_loss(
     """Return for which chambers (n_chambers,) a loss of pressure explains the arm's shape.
 
     The springs' deviations from the model's lengths are then, for the most part, a good share of the
-    deviations that the pressure's absence makes. A chamber at its limit with its spring off the reference
-    either is saturated or, if this holds, has lost its pressure. Redundant chambers make up for a lost one:
-    the loss shows once one of them is at its limit.
-
-    Without air all chambers come to a limit, and the loss of all pressures together explains the shape.
+    deviations that the pressure's absence makes. Redundant chambers make up for a lost one: the loss shows
+    once one of them is at its limit. Without air all chambers come to a limit, and the loss of all pressures
+    together explains the shape.
 
     Args:
         model: network of the unloaded arm.

@@ -75,17 +75,31 @@ class Link:
         if not self._simulated:
             time.sleep(max(0.0, time_s - time.monotonic()))
 
-    def read(self) -> np.ndarray | None:
-        """Return the readings (n_springs,), or None where they did not come in time.
+    def read(self, time_s: float) -> tuple[np.ndarray | None, dict[str, Any]]:
+        """Return the readings (n_springs,), None where they did not come in time, and a row of the log.
+
+        The row has time, readings, pressures, measured if they are, and motion capture unless it missed.
 
         Raises:
-            ArmFault: the sensors cannot be reached, or their number is another.
+            ArmFault: a method failed, or the shape of an array is another.
         """
+        n_springs, n_chambers = self._spec.n_springs, self._spec.n_chambers
         try:
             readings = self._call("read_sensors", lambda: np.array(self._arm.read_sensors(), float))
+            row = {"readings": self._shaped("read_sensors", readings, (n_springs,))}
         except TimeoutError:
-            return None
-        return self._shaped("read_sensors", readings, (self._spec.n_springs,))
+            readings = None
+            row = {"readings": np.full(n_springs, np.nan)}
+        row |= {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
+        if self.measures:
+            kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
+            row["pressure_kpa"] = self._shaped("pressures", kpa, (n_chambers,))
+            row["commanded_kpa"] = self.pressure_kpa
+        if self.sees:
+            for name, value in self._call("motion_capture", self._frame).items():
+                shape = self._shapes.setdefault(name, value.shape)
+                row[name] = self._shaped(f"motion_capture: {name}", value, shape)
+        return readings, row
 
     def write(self, pressure_kpa: np.ndarray) -> bool:
         """Command pressures (n_chambers,) [kPa]; return whether they were taken in time.
@@ -108,23 +122,6 @@ class Link:
         self._n_late = 0
         self._unsure = False  # last: a signal may come between these lines
         return True
-
-    def look(self, time_s: float) -> dict[str, Any]:
-        """Return a row of the log: time, pressures (measured if they are), motion capture unless it missed.
-
-        Raises:
-            ArmFault: a method failed, or the shape of an array changed.
-        """
-        row: dict[str, Any] = {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
-        if self.measures:
-            kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
-            row["pressure_kpa"] = self._shaped("pressures", kpa, (self._spec.n_chambers,))
-            row["commanded_kpa"] = self.pressure_kpa
-        if self.sees:
-            for name, value in self._call("motion_capture", self._frame).items():
-                shape = self._shapes.setdefault(name, value.shape)
-                row[name] = self._shaped(f"motion_capture: {name}", value, shape)
-        return row
 
     def vent(self) -> None:
         """Ramp all pressures to zero, and repeat writes that fail; needs the pumps alone.

@@ -1,8 +1,7 @@
 """Record an arm for calibration: poses at rest, and its motion between them. NumPy only; any arm.
 
 A step and a ramp lead from one set of pressures to the next; the step shows how fast the actuators follow.
-Each set is held until the arm is at rest by calibration's rule (`mjx_softarm.logs.rest`). Every tick is
-logged, in the columns of the control loop's log without references, goals and estimates.
+Each set is held until the arm is at rest by calibration's rule (`mjx_softarm.logs.rest`).
 
 From time to time each tip of the second half is predicted from the springs, by a Gaussian process of what
 sections that bend evenly leave: from all other poses, and from the first half alone. Once all others predict
@@ -72,7 +71,7 @@ def record(
 
     Args:
         arm: without pressure, as its driver gives it.
-        spec: the arm, for its rate, its limits and the range of its sensors.
+        spec: of the arm.
         targets_kpa (m, n_chambers) [kPa]: sets of pressures, in order.
         tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.

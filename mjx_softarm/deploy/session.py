@@ -216,9 +216,7 @@ class _Session:
         """Return the event that ends the run, and whether the arm took the pressures in time."""
         # Read the arm.
         goal = self.state.goal
-        readings = self.link.read()
-        row = self.link.look(begin_s)
-        row["readings"] = self.nothing if readings is None else readings
+        readings, row = self.link.read(begin_s)
         row["goal"] = np.full(6, np.nan) if goal is None else goal
 
         # Take a tick of the loop.

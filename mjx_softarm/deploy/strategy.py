@@ -41,28 +41,27 @@ class Strategy(Protocol):
     """Interface of a strategy: a value with a memory."""
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Return the references for a goal (6,) [mm, deg], that ahead if it moves, and the next memory."""
+        """Act or wait, towards a goal (6,) [mm, deg], that ahead if it moves."""
         ...
 
 
-# Strategy with its next memory, None: no further action is due; references (n_springs,) [m], None: the last
-# ones stay; faults
+# Strategy with its next memory, None once the springs have settled after the last action; references
+# (n_springs,) [m], None: the last ones stay; faults
 Answer = tuple[Strategy | None, np.ndarray | None, tuple[Event, ...]]
 
 
 class AtRest(NamedTuple):
-    """Actions of a policy for arms at rest: at once, then whenever the springs have settled."""
+    """Actions of a policy for arms at rest: at once, then whenever the springs have settled.
+
+    An action that would lead away from the goal is tried with smaller shifts. Where none will do, the arm has
+    arrived.
+    """
 
     shift: np.ndarray = np.zeros(6)  # [mm, deg]
     n_actions: int = 0
     acted_load: Load | None = None  # payload at the last action
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Act or wait; arrive once the springs have settled after the last action.
-
-        An action that would lead away from the goal is tried with smaller shifts. Where none will do, the arm
-        has arrived.
-        """
         policy = belief.controller.policy
         # The first action has no shift; the next actions correct the error that it leaves.
         if not self.n_actions:
@@ -119,7 +118,6 @@ class Timed(NamedTuple):
     n_actions: int = 0
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Act or wait; arrive once the springs have settled after the last action."""
         policy = belief.controller.policy
         is_over = self.n_actions == policy.n_actions
         if self.n_actions and _waits(belief, SETTLE_TIMEOUT_S if is_over else policy.action_s):
@@ -140,7 +138,7 @@ def to_fixed_goal(policy: Policy) -> AtRest | Timed:
 def _waits(belief: Belief, timeout_s: float) -> bool:
     """Return True while waiting: not at rest, and no timeout [s] since the last action yet."""
     if belief.settled:
-        return bool(belief.suspect.any())  # whether a chamber is lost comes first
+        return bool(belief.n_suspect.any())  # whether a chamber is lost comes first
     return belief.command.n_ticks * belief.controller.dt_s < timeout_s
 
 

@@ -1,13 +1,7 @@
 """Arms by name, and checks before any pressure that an arm is the one of a specification or of a policy.
 
-    package.module:Class   a driver
-    wiring.toml            an arm at a serial line (`mjx_softarm.deploy.drivers.serial_line`)
-    twin:SEED              a twin; `twin:rod:SEED` is a rod; `twin:SEED@ARM` has another arm, as for `--spec`
-
-Options follow a twin's name, in this order. `:pipe300`, or another of `mjx_softarm.mechanics.pipe.PIPES`,
-puts it into a pipe. `:aged` is the same arm some months later: each spring's zero is 1 mm off, and the
-chambers are 5 % softer. `:exact` has all parts as specified, with friction, hysteresis and noise. `:lost4`
-takes the pressure of chamber 4. `:500g` hangs a payload of 500 g on it.
+A name is `package.module:Class`, a driver; `wiring.toml`, an arm at a serial line (`drivers.serial_line`); or
+that of a twin, such as `twin:SEED` (`mjx_softarm.twin.names`).
 """
 
 from __future__ import annotations
