@@ -4,6 +4,7 @@ NatNet: `PacketClient.cpp` and the packet's description of OptiTrack's NatNet SD
 Server Protocol Documentation", version 1.25. Both are written without the packages under test.
 """
 
+import contextlib
 import socket
 import struct
 import threading
@@ -157,49 +158,40 @@ class QualisysServer(Server):
     def serve(self):
         with self.listener:
             for frames in self.frames():
-                if self.client is None:
-                    self.accept()
-                else:
-                    self.answer()
-                for frame in frames if self.streams else ():
-                    self.send(3, frame)
+                try:
+                    if self.client is None:
+                        self.accept()
+                    else:
+                        self.answer()
+                    for frame in frames if self.streams else ():
+                        self.send(3, frame)
+                except ConnectionError:
+                    self.drop()
         if self.client is not None:
-            self.client.close()
-
-    def accept(self):
-        try:
-            self.client = self.listener.accept()[0]
-        except TimeoutError:
-            return
-        self.client.settimeout(1.0)
-        self.send(1, b"QTM RT Interface connected\0")
-
-    def send(self, kind, data):
-        if self.client is None:
-            return
-        packet = struct.pack("<II", 8 + len(data), kind) + data
-        try:  # in two parts, as they may come over a network
-            self.client.sendall(packet[:11])
-            self.client.sendall(packet[11:])
-        except OSError:
             self.drop()
 
     def drop(self):
         self.client.close()
         self.client, self.streams = None, False
 
+    def accept(self):
+        with contextlib.suppress(TimeoutError):
+            self.client = self.listener.accept()[0]
+            self.send(1, b"QTM RT Interface connected\0")
+
+    def send(self, kind, data):
+        packet = struct.pack("<II", 8 + len(data), kind) + data
+        self.client.settimeout(1.0)
+        self.client.sendall(packet[:11])  # in two parts, as they may come over a network
+        self.client.sendall(packet[11:])
+
     def answer(self):
-        self.client.setblocking(False)
-        try:
+        self.client.settimeout(0.0)
+        data = b""
+        with contextlib.suppress(BlockingIOError):
             data = self.client.recv(4096)
-        except BlockingIOError:
-            return
-        except ConnectionResetError:
-            data = b""
-        finally:
-            self.client.settimeout(1.0)
-        if not data:
-            self.drop()
+            if not data:
+                raise ConnectionResetError
         while data:
             size, _ = struct.unpack("<II", data[:8])
             self.command(data[8:size].rstrip(b"\0").decode().lower())
