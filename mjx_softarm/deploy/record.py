@@ -57,7 +57,6 @@ class PoseRecording(NamedTuple):
     n_poses: int  # number of poses at rest
     n_unsettled: int  # number of poses not seen at rest within TIMEOUT_S
     ending: Ending
-    error_mm: float  # median error of tips that the other poses predict; NaN if unknown
 
 
 def record(
@@ -79,8 +78,6 @@ def record(
     rows = Recorder()
     rest = []  # whether each pose was seen at rest
     poses = []  # spring lengths and tip [m] of each pose with both
-    error_mm = np.nan
-    n_enough = 0
 
     def on_tick(row: dict) -> None:
         hold.add(row)
@@ -89,10 +86,11 @@ def record(
     drive = Drive(arm, spec, on_tick)
     hold = _Hold(drive)
     step_kpa = STEP_SHARE * (spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa)
-    began_s = reported_s = time.monotonic()
 
     def run() -> None:
-        nonlocal reported_s, error_mm, n_enough
+        began_s = reported_s = time.monotonic()
+        error_mm = np.nan
+        n_enough = 0
         for k, target_kpa in enumerate(targets_kpa, 1):
             # Drive to the pressures, and check the arm.
             hold.ticks.clear()
@@ -123,7 +121,7 @@ def record(
         return rows.log("record", drive.sensor)
 
     ending = vent_at_end(run, drive.link, tell, lambda: save(log()) if len(rows) else None)
-    return PoseRecording(log(), sum(rest), len(rest) - sum(rest), ending, error_mm)
+    return PoseRecording(log(), sum(rest), len(rest) - sum(rest), ending)
 
 
 def prediction_errors_mm(poses: np.ndarray, spec: ArmSpec) -> tuple[float, float]:

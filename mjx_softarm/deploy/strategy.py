@@ -62,23 +62,22 @@ class AtRest(NamedTuple):
     acted_load: Load | None = None  # payload at the last action
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        policy = belief.controller.policy
         # The first action has no shift; the next actions correct the error that it leaves.
-        if not self.n_actions:
-            return self._act(belief, goal, [np.zeros(6)])
-        if _waits(belief, SETTLE_TIMEOUT_S):
-            return self, None, ()
-
-        events = unsettled(belief)
-        if self.n_actions == policy.n_actions:
-            return None, None, events
+        policy = belief.controller.policy
+        shifts = [self.shift]
+        allowed = None
+        events: tuple[Event, ...] = ()
+        if self.n_actions:
+            if _waits(belief, SETTLE_TIMEOUT_S):
+                return self, None, ()
+            events = unsettled(belief)
+            if self.n_actions == policy.n_actions:
+                return None, None, events
 
         # Shifts that take all, or a share, of the error that the references leave. The payload's deflection
         # is compensated once: by the next action of a policy that observes the payload, else by the shift.
         # So for such a policy the error is estimated with the payload of its last action.
-        shifts = [self.shift]
-        allowed = None
-        if belief.settled:
+        if self.n_actions and belief.settled:
             reference_m = belief.command.reference_m
             assert reference_m is not None and self.acted_load is not None
             pose = acted = _pose_made(belief, reference_m, belief.load)
@@ -87,23 +86,14 @@ class AtRest(NamedTuple):
             left = asked_error(acted, goal, policy.reward)
             shifts = [clipped(self.shift - share * left) for share in SHARES]
             allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
-        return self._act(belief, goal, shifts, events, allowed)
 
-    def _act(
-        self,
-        belief: Belief,
-        goal: np.ndarray,
-        shifts: list[np.ndarray],
-        events: tuple[Event, ...] = (),
-        allowed: float | None = None,
-    ) -> Answer:
-        """Take the first shift whose references leave a weighted error of at most `allowed`, if given."""
+        # The first shift whose references leave no larger error counts.
         events += extrapolated(belief)
         for shift in shifts:
             reference_m = planned(belief, belief.pose, goal + shift)
             if allowed is not None:
                 pose = _pose_made(belief, reference_m, belief.load)
-                if weighted_error(pose, goal, belief.controller.policy.reward) > allowed:
+                if weighted_error(pose, goal, policy.reward) > allowed:
                     continue
             return AtRest(shift, self.n_actions + 1, belief.load), reference_m, events
         return None, None, events

@@ -25,6 +25,11 @@ COMMAND_PORT = 1510
 DATA_PORT = 1511
 WAIT_S = 2.0  # longest wait for the server's answer, for its descriptions, and for the first frame
 AGAIN_S = 1.0  # time without a frame after which the server is asked again; it may have begun anew
+MOST = 500  # most frames that one poll reads; a socket holds fewer, and a flood does not stop the loop
+
+
+class _Enough(Exception):
+    """Signal that a poll has read the largest number of frames."""
 
 
 class NatNet:
@@ -93,7 +98,7 @@ class NatNet:
         self._client = self._package.NatNetClient(
             self._host, local, command_port=COMMAND_PORT, data_port=DATA_PORT, use_multicast=multicast
         )
-        self._client.on_data_frame_received_event.handlers.append(self._new.append)
+        self._client.on_data_frame_received_event.handlers.append(self._on_frame)
         self._client.on_data_description_received_event.handlers.append(self._on_descriptions)
         try:
             self._client.connect(WAIT_S)
@@ -112,8 +117,15 @@ class NatNet:
         try:
             with contextlib.redirect_stdout(io.StringIO()):  # the package prints each odd packet
                 self._client.update_sync()
+        except _Enough:
+            pass
         except (struct.error, UnicodeDecodeError, TypeError, self._package.NatNetError) as error:
             raise OSError(f"got a packet that cannot be read: {error}") from error
+
+    def _on_frame(self, frame: Any) -> None:
+        self._new.append(frame)
+        if len(self._new) >= MOST:
+            raise _Enough
 
     def _on_descriptions(self, described: Any) -> None:
         self._described = described

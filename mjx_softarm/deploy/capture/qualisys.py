@@ -20,6 +20,9 @@ from mjx_softarm.deploy.capture.system import CaptureFrame, CaptureName, check_n
 PORT = 22223  # port of the protocol with little-endian numbers
 VERSION = "1.25"  # version of the protocol
 WAIT_S = 3.0  # longest wait for QTM's answers
+ROUNDS = (
+    50  # rounds of the event loop in a poll: they read more than a socket holds, but do not stop the loop
+)
 
 
 class Qualisys:
@@ -49,7 +52,7 @@ class Qualisys:
             OSError: the connection has ended.
         """
         newest = None
-        while True:  # one round of the event loop takes a part of the packets that have queued up
+        for _ in range(ROUNDS):  # each takes a part of the packets that have queued up
             self._loop.run_until_complete(asyncio.sleep(0))
             if self._packet is None:
                 break
