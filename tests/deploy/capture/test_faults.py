@@ -11,12 +11,18 @@ from mjx_softarm.deploy import capture
 from tests.deploy.capture.scene import POSE, SYSTEMS, look, missed, scene_of
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_a_lost_body_is_a_gap_that_is_told(system, serve, opened, monkeypatch):
+@pytest.fixture(params=SYSTEMS)
+def watched(request, serve, opened):
+    """A system's scene, the arm in it, which was seen, and lines that it tells."""
     scene = scene_of()
-    serve(system, scene)
-    arm, lines = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
+    serve(request.param, scene)
+    arm, lines = opened(f"{request.param}:127.0.0.1:tip,base=base,up=z")
     look(arm)
+    return scene, arm, lines
+
+
+def test_a_lost_body_is_a_gap_that_is_told(watched, monkeypatch):
+    scene, arm, lines = watched
     scene.hidden = {"base"}  # which does not move
     for _ in range(10):
         np.testing.assert_allclose(1e3 * look(arm).tip_m, POSE[:3], atol=1e-2)
@@ -33,12 +39,8 @@ def test_a_lost_body_is_a_gap_that_is_told(system, serve, opened, monkeypatch):
     assert re.search(r"the tip was seen in \d+ of \d+ ticks; at most \d+ ms later", arm.finish())
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_late_frames_are_missed(system, serve, opened):
-    scene = scene_of()
-    serve(system, scene)
-    arm, _ = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
-    look(arm)
+def test_late_frames_are_missed(watched):
+    scene, arm, _ = watched
     scene.held = True  # frames are made but not sent
     missed(arm, "got no new frame from 127.0.0.1")
     time.sleep(0.1)
@@ -82,20 +84,18 @@ def test_a_body_that_the_system_does_not_describe_is_no_base(serve, opened):
         np.testing.assert_allclose(1e3 * look(arm).tip_m, POSE[:3], atol=1e-2)
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_frames_that_queued_up_are_not_taken_for_new_ones(system, serve, opened, monkeypatch):
+def test_frames_that_queued_up_are_not_taken_for_new_ones(watched, monkeypatch):
     monkeypatch.setattr("mjx_softarm.deploy.capture.natnet.AGAIN_S", 100.0)
     monkeypatch.setattr(capture, "LOST_S", 0.2)
-    scene = scene_of(base=False)
-    serve(system, scene)
-    arm, _ = opened(f"{system}:127.0.0.1:tip,up=z")
-    look(arm)
-    for _ in range(2):
+    scene, arm, _ = watched
+    place_m, axes = scene.bodies["tip"]
+    before_m = look(arm).tip_m
+    for k in (1, 2):
         time.sleep(0.5)  # 100 frames
-        place_m, axes = scene.bodies["tip"]
-        scene.bodies["tip"] = place_m + 0.01, axes
+        scene.bodies["tip"] = place_m + 0.01 * k, axes
         time.sleep(0.05)
-        np.testing.assert_allclose(look(arm).tip_m, place_m + 0.01, atol=1e-5)
+        moved_m = np.linalg.norm(look(arm).tip_m - before_m)
+        assert moved_m == pytest.approx(0.01 * k * 3**0.5, abs=1e-5)
 
 
 def test_servers_that_do_not_answer_are_named(serve, opened, monkeypatch):
@@ -110,13 +110,11 @@ def test_servers_that_do_not_answer_are_named(serve, opened, monkeypatch):
             opened(f"{system}:127.0.0.1:tip")
 
 
-def test_packets_that_cannot_be_read_are_gaps(serve, opened, monkeypatch):
-    scene = scene_of()
-    server = serve("natnet", scene)
+def test_packets_that_cannot_be_read_are_gaps(serve, opened):
+    server = serve("natnet", scene_of())
     arm, _ = opened("natnet:127.0.0.1:tip,base=base,up=z")
     whole = server.frame
-    monkeypatch.setattr(server, "frame", lambda *args: whole(*args)[:90])
+    server.frame = lambda *args: whole(*args)[:90]
     missed(arm, "got a packet that cannot be read")
-    monkeypatch.undo()
     server.frame = whole
     look(arm)
