@@ -41,7 +41,8 @@ from mjx_softarm.spec import ArmSpec
 
 LATE_S = 0.05  # delay, beyond that of the fastest frames, of a frame that is late; by hand
 DRIFT = 1e-3  # largest difference of the two clocks' rates that is not taken for a delay; by hand
-LOST_S = 1.0  # time without the tip after which it is reported lost; greatest delay of a clock; by hand
+LOST_S = 1.0  # time without the tip after which it is reported lost; by hand
+ANEW_S = 1.0  # larger delays show that the system's clock has begun anew; by hand
 # Largest distance of the tip from the end of the straight arm, in its lengths, and largest angle; by hand.
 # Wrong axes are 1.4 lengths and 90 degrees off.
 _NEAR = 0.5
@@ -54,15 +55,17 @@ class Delay:
 
     def __init__(self) -> None:
         self._offset_s = np.inf  # between the clocks, with the delay of the fastest frame
+        self._frame_s = -np.inf
         self._now_s = 0.0
 
     def measure(self, frame_s: float, now_s: float) -> float:
         """Return the delay [s] of a frame with a time [s] on its own clock, taken at a time [s] on ours."""
         drifted_s = self._offset_s + DRIFT * (now_s - self._now_s)
         delay_s = now_s - frame_s - drifted_s
-        # It is the fastest frame, or the system has begun anew, and its clock with it.
-        anew = not 0.0 <= delay_s <= LOST_S
-        self._offset_s = now_s - frame_s if anew else drifted_s
+        is_fastest = delay_s < 0.0
+        is_anew = frame_s < self._frame_s or delay_s > ANEW_S
+        self._offset_s = now_s - frame_s if is_fastest or is_anew else drifted_s
+        self._frame_s = frame_s
         self._now_s = now_s
         return max(delay_s, 0.0)
 

@@ -20,9 +20,7 @@ from mjx_softarm.deploy.capture.system import CaptureFrame, CaptureName, check_n
 PORT = 22223  # port of the protocol with little-endian numbers
 VERSION = "1.25"  # version of the protocol
 WAIT_S = 3.0  # longest wait for QTM's answers
-ROUNDS = (
-    50  # rounds of the event loop in a poll: they read more than a socket holds, but do not stop the loop
-)
+ROUNDS = 50  # most rounds of the event loop in a poll; they read more than a socket holds
 
 
 class Qualisys:

@@ -57,7 +57,6 @@ def test_a_server_that_goes_does_not_hold_up_the_loop_and_motive_may_come_back(
     system, serve, opened, monkeypatch
 ):
     monkeypatch.setattr("mjx_softarm.deploy.capture.natnet.AGAIN_S", 0.05)
-    monkeypatch.setattr(capture, "LOST_S", 0.05)
     server = serve(system, scene_of())
     arm, _ = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
     look(arm)
@@ -86,7 +85,6 @@ def test_a_body_that_the_system_does_not_describe_is_no_base(serve, opened):
 
 def test_frames_that_queued_up_are_not_taken_for_new_ones(watched, monkeypatch):
     monkeypatch.setattr("mjx_softarm.deploy.capture.natnet.AGAIN_S", 100.0)
-    monkeypatch.setattr(capture, "LOST_S", 0.2)
     scene, arm, _ = watched
     place_m, axes = scene.bodies["tip"]
     before_m = look(arm).tip_m
