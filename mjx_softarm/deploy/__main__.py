@@ -6,7 +6,7 @@ However a command ends, the arm is vented and what was logged is written.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -53,9 +53,7 @@ _ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 def _goal(words: list[str]) -> tuple[float, ...]:
     goal = tuple(map(float, words[0].split(",")))
     if len(goal) not in (3, 6):
-        raise ValueError(
-            f"got {len(goal)} numbers, expected x,y,z,yaw,pitch,roll, or x,y,z for positions alone"
-        )
+        raise ValueError(f"got {len(goal)} numbers, expected x,y,z,yaw,pitch,roll, or x,y,z alone")
     return goal
 
 
@@ -92,7 +90,7 @@ class DriverOptions:
         ),
     ] = None
 
-    def open(self, spec: ArmSpec, tell: Callable[[str], None]) -> Any:
+    def open(self, spec: ArmSpec) -> Any:
         """Open the driver of an arm with this specification, and its motion capture."""
         driver = open_arm(self.arm)
         if self.arm.startswith("twin:") and ArmSpec.of(twin_spec(self.arm)).geometry != spec.geometry:
@@ -127,7 +125,6 @@ def _run(
         duration: [s] of the arm after which the run ends
         stay: hold the last goal, until Ctrl-C or the end of the duration
     """
-    # Checks, before the arm moves
     if not goal:
         raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
@@ -135,15 +132,14 @@ def _run(
     controller = _controller(policy)
     goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
-    driver = options.open(controller.policy.spec, tell)
+    driver = options.open(controller.policy.spec)
     check_arm(driver, controller, f"--arm {options.arm}")
 
-    # The run, its log and its faults
     save = partial(save_log, log) if log else lambda log: None
     run = follow(driver, controller, goals, duration, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
-    finish(driver, tell)
+    finish(driver)
     print_run(run, controller.policy)
     return run.status
 
@@ -173,7 +169,6 @@ def _measure(
         payload: mass that hangs at the gripper, which the loop is not given; a simulated arm gets it [g];
             None: the loop's estimate counts
     """
-    # Checks, before the arm moves
     if payload is not None and not 0.0 <= payload < np.inf:
         raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
@@ -184,11 +179,10 @@ def _measure(
     poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
-    driver = options.open(controller.policy.spec, tell)
+    driver = options.open(controller.policy.spec)
     first_frame(driver, f"--arm: {options.arm}")
     check_arm(driver, controller, f"--arm {options.arm}")
 
-    # The run, stop by stop or in time
     out.mkdir(parents=True)
     payload_kg = None if payload is None else controller.policy.spec.mass.payload_kg + 1e-3 * payload
     if payload and hasattr(driver, "attach"):
@@ -203,7 +197,7 @@ def _measure(
     else:
         pace_s = seconds / max(len(poses) - 1, 1)
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
-    finish(driver, tell)
+    finish(driver)
     print_run(run, controller.policy)
     print_origin(controller.policy, options.arm)
     if run.arrivals:
@@ -251,7 +245,6 @@ def _record(
         poses: number of random poses, at most
         seed: seed of the poses
     """
-    # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
     twin = twin_spec(options.arm)
@@ -260,17 +253,16 @@ def _record(
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
 
-    driver = options.open(arm_spec, tell)
+    driver = options.open(arm_spec)
     check_number(driver, arm_spec, f"--arm {options.arm}")
     low, high = arm_spec.chambers.pressure_min_kpa, arm_spec.chambers.pressure_max_kpa
     default = "" if spec or twin else ", by default; --spec names another arm"
     tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
-
-    # The recording and its results
     tell(ACCURACY)
+
     targets_kpa = growing(random_pressures(arm_spec, poses, seed))
     result = record(driver, arm_spec, targets_kpa, tell, partial(save_log, out))
-    finish(driver, tell)
+    finish(driver)
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
         return result.ending.status or MISSED
@@ -286,7 +278,7 @@ def _record(
     return result.ending.status
 
 
-def finish(driver: Any, tell: Callable[[str], None]) -> None:
+def finish(driver: Any) -> None:
     """End the motion capture that `--capture` began, and report its frames in a line."""
     if isinstance(driver, CapturedArm):
         tell(driver.finish())

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.control import Gains, allocated_error, at_chambers, saturated
-from mjx_softarm.deploy.controller import Command, Controller
+from mjx_softarm.control import Gains, LawState, allocated_error, at_chambers, saturated
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import ARRIVED_M, still
 from mjx_softarm.policy.runtime import tip_pose
@@ -25,6 +26,7 @@ from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.hysteresis import stop_after
 from mjx_softarm.sensing.load import KNOWN, Load, averaged, estimate_load, holds_payload
 from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import ArmSpec
 
 STUCK_RANGE_M = 1e-5  # range of a stuck sensor over a window; a live one's noise is larger
 STUCK_PRESSURE_KPA = 2.0  # range of its chamber's pressure at which a live one moves; by hand
@@ -37,6 +39,22 @@ NO_AIR_SHARE = 1.5  # share of all pressures from which the shape is not that wi
 EXPLAINED_SHARE = 0.7  # least share of the springs' squared deviations that this explains
 LOST_EFFECT_M = 0.01  # least change at the chamber; tolerances and payloads look like less
 _NO_EFFECT_M2 = 1e-18
+
+
+class Command(NamedTuple):
+    """References and pressures in force."""
+
+    reference_m: np.ndarray | None  # (n_springs,) None: the pressures go to zero
+    n_ticks: int  # ticks since the references or the goal were new
+    law: LawState  # NaN lengths before the first reading
+    pressure_kpa: np.ndarray  # (n_chambers,)
+
+    @classmethod
+    def none(cls, spec: ArmSpec) -> Command:
+        """Return the command of an arm without pressure."""
+        zero_kpa = np.zeros(spec.n_chambers)
+        unknown_m = np.full(spec.n_springs, np.nan)
+        return cls(None, 0, LawState.at_rest(zero_kpa, unknown_m), zero_kpa)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,17 +107,15 @@ class Belief:
     @cached_property
     def _tip(self) -> tuple[np.ndarray, float]:
         # Only when asked for: in most ticks after the pressures are written, for the log.
-        return pose_of(self.controller, self.spring_m, self.load)
+        if not self.known:
+            return np.full(6, np.nan), 0.0
+        pose, away = tip_pose(self.controller.policy, self.spring_m, self.load.believed_kg)
+        return pose, float(away)
 
     @property
     def lost(self) -> np.ndarray:
         """Springs (n_springs,), bool, without a reading in this tick."""
         return self.n_lost > 0
-
-    @property
-    def suspect(self) -> np.ndarray:
-        """Chambers (n_chambers,), bool, that seem to have lost their pressure."""
-        return self.n_suspect > 0
 
     @property
     def known(self) -> bool:
@@ -154,8 +170,9 @@ def believe(
 
     # Lengths, and the windows that end with them
     spring_m, lost, why = read_lengths(policy.sensor, readings, last.spring_m)
-    seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
-    chamber_kpa = np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
+    chamber_kpa = in_force_kpa
+    if measured_kpa is not None:
+        chamber_kpa = np.where(np.isfinite(measured_kpa), measured_kpa, in_force_kpa)
     belief = replace(
         last,
         command=command,
@@ -193,7 +210,7 @@ def _with_load(belief: Belief) -> Belief:
     An estimate whose interval holds no payload leaves the specified payload. One that is not known well
     changes nothing.
     """
-    doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
+    doubtful = belief.lost.any() or belief.stuck.any() or belief.n_suspect.any()
     if not belief.at_rest or belief.n_unweighed < belief.controller.window or doubtful:
         return belief
     model = belief.controller.policy.load_estimator
@@ -214,15 +231,9 @@ def hysteresis_after(policy: Policy, stop: Array, last_m: Array, spring_m: Array
     return stop_after(stop, moved_m, policy.load_estimator.stroke_m)
 
 
-def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
-    """Return the tip pose (6,) [mm, deg] of springs (n_springs,) [m] with a payload, NaN where a length is.
-
-    Beside it stands `s2r.extrapolation` of the pose, 0 without a network.
-    """
-    if np.isnan(spring_m).any():
-        return np.full(6, np.nan), 0.0
-    pose, away = tip_pose(controller.policy, spring_m, load.believed_kg)
-    return pose, float(away)
+def pose_of(policy: Policy, spring_m: np.ndarray, load_kg: float) -> np.ndarray:
+    """Return the tip pose (6,) [mm, deg] of springs (n_springs,) [m] with a payload."""
+    return np.asarray(tip_pose(policy, spring_m, load_kg)[0], float)
 
 
 def read_lengths(
@@ -289,11 +300,9 @@ def explained_by_pressure_loss(
     """Return for which chambers (n_chambers,) a loss of pressure explains the arm's shape.
 
     The springs' deviations from the model's lengths are then, for the most part, a good share of the
-    deviations that the pressure's absence makes. A chamber at its limit with its spring off the reference
-    either is saturated or, if this holds, has lost its pressure. Redundant chambers make up for a lost one:
-    the loss shows once one of them is at its limit.
-
-    Without air all chambers come to a limit, and the loss of all pressures together explains the shape.
+    deviations that the pressure's absence makes. Redundant chambers make up for a lost one: the loss shows
+    once one of them is at its limit. Without air all chambers come to a limit, and the loss of all pressures
+    together explains the shape.
 
     Args:
         model: network of the unloaded arm.

@@ -1,24 +1,21 @@
-"""A policy made ready for the control loop, and a command of the loop. NumPy only."""
+"""A policy made ready for the control loop. NumPy only."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.control import LawState
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import RestRule, middle_kpa, rest_rule, spring_lag_s
 from mjx_softarm.policy.reach import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
-from mjx_softarm.spec import ArmSpec
 
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A policy made ready for the loop."""
+    """A policy, and what the loop computes of it once."""
 
     policy: Policy
     reachable: Reachable
@@ -46,19 +43,3 @@ class Controller:
     def window(self) -> int:
         """Number of ticks over which springs are watched."""
         return self.rest.window
-
-
-class Command(NamedTuple):
-    """References and pressures in force."""
-
-    reference_m: np.ndarray | None  # (n_springs,) None: the pressures go to zero
-    n_ticks: int  # ticks since the references or the goal were new
-    law: LawState  # NaN lengths before the first reading
-    pressure_kpa: np.ndarray  # (n_chambers,)
-
-    @classmethod
-    def none(cls, spec: ArmSpec) -> Command:
-        """Return the command of an arm without pressure."""
-        zero_kpa = np.zeros(spec.n_chambers)
-        unknown_m = np.full(spec.n_springs, np.nan)
-        return cls(None, 0, LawState.at_rest(zero_kpa, unknown_m), zero_kpa)

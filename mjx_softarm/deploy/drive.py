@@ -119,11 +119,9 @@ class Drive:
     def _tick(self, law: Law) -> tuple[dict, np.ndarray | None, bool]:
         """Return the row, the spring lengths (n_springs,) if none was lost, whether the law has arrived."""
         begin_s = self.link.now()
+        readings, row = self.link.read(begin_s)
         nothing = np.full(self.spec.n_springs, np.nan)
-        readings = self.link.read()
-        row = self.link.look(begin_s)
         spring_m, lost, text = read_lengths(self.sensor, readings, nothing)
-        row["readings"] = nothing if readings is None else readings
         self.n_lost = self.n_lost + 1 if lost.any() else 0
         known_m = None if lost.any() else spring_m
         try:

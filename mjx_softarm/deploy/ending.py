@@ -50,9 +50,11 @@ def vent_at_end(
     change nothing; only a second Ctrl-C ends the venting. `tell` takes a line for each error, last, since a
     terminal may block; its own exceptions are ignored.
     """
-    finish = _Finish({"drive": body, "vent": link.vent, "save": save})
+    finish = _Finish()
     with _signals(finish.on_signal):
-        finish.run()
+        finish.run("drive", body)
+        finish.run("vent", link.vent)
+        finish.run("save", save)
     for line in finish.lines:
         with contextlib.suppress(Exception):
             tell(line)
@@ -60,10 +62,9 @@ def vent_at_end(
 
 
 class _Finish:
-    """Steps that run one after the other, even after one that raises."""
+    """Notes of the steps, each of which runs whatever the one before raised."""
 
-    def __init__(self, steps: dict[str, Callable[[], Any]]):
-        self._steps = steps
+    def __init__(self) -> None:
         self._running = ""
         self._signals: list[int] = []  # signals that ended no step
         self._n_interrupts = 0
@@ -72,14 +73,14 @@ class _Finish:
         self.status = DONE
         self.vented = True
 
-    def run(self) -> None:
-        for step in self._steps:
-            goes_on = True
-            while goes_on:
-                error = self._attempt(step)
-                goes_on = error is not None and self._note(step, error)
-                while self._signals:
-                    self._note(step, Terminated(self._signals.pop(0)), ended=False)
+    def run(self, step: str, action: Callable[[], Any]) -> None:
+        """Run a step, again where a signal ended it that it survives."""
+        goes_on = True
+        while goes_on:
+            error = self._attempt(step, action)
+            goes_on = error is not None and self._note(step, error)
+            while self._signals:
+                self._note(step, Terminated(self._signals.pop(0)), ended=False)
 
     def on_signal(self, number: int, _frame: Any) -> None:
         """Raise in the step that the signal ends, once; note it otherwise."""
@@ -90,12 +91,12 @@ class _Finish:
             raise Terminated(number)
         self._signals.append(number)
 
-    def _attempt(self, step: str) -> BaseException | None:
+    def _attempt(self, step: str, action: Callable[[], Any]) -> BaseException | None:
         """Return the exception of a step; a signal may come anywhere in here, even with another error."""
         try:
             try:
                 self._running = step
-                self._steps[step]()
+                action()
                 self._running = ""
             except BaseException as error:
                 self._running = ""
@@ -108,9 +109,8 @@ class _Finish:
         """Note an error or a signal; return whether the step goes on after it."""
         signalled = isinstance(error, (KeyboardInterrupt, Terminated))
         self._n_interrupts += isinstance(error, KeyboardInterrupt)  # raised by the body itself
-        goes_on = not ended or (
-            signalled and step != "drive" and self._n_interrupts <= _INTERRUPTS.get(step, 2)
-        )
+        survives = step != "drive" and self._n_interrupts <= _INTERRUPTS[step]
+        goes_on = not ended or (signalled and survives)
         if signalled:
             text = str(error) or "interrupted"
             number = error.number if isinstance(error, Terminated) else signal.SIGINT

@@ -11,15 +11,69 @@ from typing import Literal
 import numpy as np
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.loop import LoopState, hold, refusals, release, with_goal
+from mjx_softarm.deploy.loop import LoopState
 from mjx_softarm.deploy.moving import lead_of, to_moving_goal
-from mjx_softarm.deploy.safety import Event
+from mjx_softarm.deploy.safety import Event, Fault
+from mjx_softarm.deploy.strategy import to_fixed_goal
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.reach import nearest, nearest_poses
 from mjx_softarm.sensing.pose import pose_error
 
 Events = tuple[Event, ...]
 # An order for the next tick: let the pressures go to zero, after which a goal brings the arm up again; give
 # up the goals and hold the springs where they are; poses (6,) [mm, deg] that replace all others; no change
 Order = Literal["vent", "hold"] | Sequence[np.ndarray] | None
+
+
+def with_goal(state: LoopState, goal: np.ndarray) -> tuple[LoopState, Events]:
+    """Return the state with a goal (6,) [mm, deg]; unchanged, with an event, if the goal is refused."""
+    controller = state.belief.controller
+    goal = np.asarray(goal, float)
+    text = ", ".join(f"{value:g}" for value in goal)
+    if goal.shape != (6,) or not np.isfinite(goal).all():
+        return state, (Event(Fault.GOAL_OUTSIDE, f"got {text}, expected six finite numbers"),)
+    pose, away = nearest(controller.reachable, goal)
+    if away > 1.0:
+        near = ", ".join(f"{value:.0f}" for value in pose)
+        far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
+        return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
+    strategy = to_fixed_goal(controller.policy)
+    command = state.command._replace(n_ticks=0)
+    return state._replace(goal=goal, ahead=None, strategy=strategy, command=command), ()
+
+
+def hold(state: LoopState) -> LoopState:
+    """Return the state without a goal, the springs held as they were read last.
+
+    An arm without references, which has no pressure or is being vented, stays so.
+    """
+    if state.command.reference_m is None or not state.belief.known:
+        return state._replace(goal=None)
+    held = state.command._replace(reference_m=state.belief.spring_m, n_ticks=0)
+    return state._replace(goal=None, command=held)
+
+
+def release(state: LoopState) -> LoopState:
+    """Return the state without goal and references, in which the pressures go to zero along the ramp."""
+    return state._replace(goal=None, command=state.command._replace(reference_m=None))
+
+
+def refusals(policy: Policy, goals: Sequence[np.ndarray]) -> dict[int, Event]:
+    """Return which goals (6,) [mm, deg] are refused, since no pressures reach them; takes longer than a tick.
+
+    It is sharper than `with_goal`, whose poses lie some 15 mm apart.
+    """
+    finite = [k for k, goal in enumerate(goals) if np.shape(goal) == (6,) and np.isfinite(goal).all()]
+    if not finite:
+        return {}
+    poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
+    refused = {}
+    for k, pose, error in zip(finite, poses, errors, strict=True):
+        if not error <= policy.reward.threshold:
+            got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
+            message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
+            refused[k] = Event(Fault.GOAL_OUTSIDE, message)
+    return refused
 
 
 class ListedGoals:
@@ -29,41 +83,36 @@ class ListedGoals:
 
     def __init__(
         self,
-        controller: Controller,
+        policy: Policy,
         goals: Iterable[np.ndarray],
         duration_s: float = np.inf,
         stay: bool = False,
     ):
-        self._controller = controller
         self._goals = list(goals)
-        self._refused = refusals(controller.policy, self._goals)  # now: it takes longer than a tick
+        self._refused = refusals(policy, self._goals)  # now: it takes longer than a tick
         self._duration_s = duration_s
         self._stays = stay
         self._began_s = np.nan
-        self._accepted = False
         self.n_goals = len(self._goals)
         self.n_taken = 0
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
-        """Go on to the next accepted goal where there is none; end after the last one, or the duration.
+        """Return the state with the goal of this tick, None once the run is over; and refusals of goals.
 
         Args:
             state: after the last tick.
             now_s: time.
             row: of the log, in this tick.
-
-        Returns:
-            The state with the goal of this tick, None where the run is over; refusals of goals.
         """
         if np.isnan(self._began_s):
             self._began_s = now_s
-        state, events = self.take_next(state)
+        state, events = self._with_next(state)
         ended = state.goal is None and self.n_taken == len(self._goals)
-        over = ended and not (self._stays and self._accepted)
-        over |= now_s - self._began_s >= self._duration_s
+        stays = self._stays and state.command.reference_m is not None
+        over = (ended and not stays) or now_s - self._began_s >= self._duration_s
         return None if over else state, events
 
-    def take_next(self, state: LoopState) -> tuple[LoopState, Events]:
+    def _with_next(self, state: LoopState) -> tuple[LoopState, Events]:
         """Return the state with the next accepted goal, if it has none, and the refusals until then."""
         refused: Events = ()
         while state.goal is None and self.n_taken < len(self._goals):
@@ -71,8 +120,7 @@ class ListedGoals:
             if self.n_taken in self._refused:
                 refused += (self._refused[self.n_taken],)
             else:
-                state, events = with_goal(self._controller, state, goal)
-                self._accepted |= not events
+                state, events = with_goal(state, goal)
                 refused += events
             self.n_taken += 1
         return state, refused
@@ -81,8 +129,8 @@ class ListedGoals:
 class OrderedGoals(ListedGoals):
     """Goals that somebody orders; they are not counted, and only an exception of `orders` ends the run."""
 
-    def __init__(self, controller: Controller, orders: Callable[[], Order]):
-        super().__init__(controller, ())
+    def __init__(self, policy: Policy, orders: Callable[[], Order]):
+        super().__init__(policy, ())
         self._orders = orders
 
     def advance(self, state: LoopState, now_s: float, row: int) -> tuple[LoopState | None, Events]:
@@ -96,7 +144,7 @@ class OrderedGoals(ListedGoals):
             self._goals = list(order)
             self.n_taken = 0
             state = state._replace(goal=None)
-        return self.take_next(state)
+        return self._with_next(state)
 
 
 class MovingGoal:
@@ -159,7 +207,7 @@ class MovingGoal:
 
     def _stop(self, state: LoopState) -> tuple[LoopState | None, Events]:
         """Return the state with the next stop as its goal, None where it is refused, and the refusal."""
-        state, events = with_goal(self._controller, state, self._poses[self.n_taken - 1])
+        state, events = with_goal(state, self._poses[self.n_taken - 1])
         return None if events else state, events
 
     def _place(self, now_s: float) -> np.ndarray:

@@ -1,10 +1,8 @@
 """One arm behind its driver: guarded calls, the pressures in force, time, and the ramp to zero.
 
-Users write drivers, so any method may raise anything. Each call here names the method that failed, checks the
-answer, and keeps the pressures that the arm has taken.
-
-A simulated arm has a clock of its own, `time_s`, which advances as pressures are written: a run is as fast as
-the computer. A real arm has none: the loop waits for each tick.
+Users write drivers, so any method may raise anything: each call names the method that failed, and checks its
+answer. A simulated arm has a clock of its own, `time_s`, which advances as pressures are written: a run is as
+fast as the computer. For a real arm the loop waits for each tick.
 """
 
 from __future__ import annotations
@@ -44,10 +42,7 @@ class ArmFault(Exception):
 
 
 class Link:
-    """An arm without pressure at first, and a control loop of a period `dt_s`.
-
-    The driver's `pressures`, `motion_capture` and `time_s` are used if it has them.
-    """
+    """An arm without pressure at first, and a control loop of a period `dt_s`."""
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, dt_s: float):
         self._arm: Any = arm
@@ -55,7 +50,8 @@ class Link:
         self._dt_s = dt_s
         self._n_late = 0
         self._simulated = hasattr(arm, "time_s")
-        self.measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
+        self.measures = hasattr(arm, "pressures")
+        self.sees = hasattr(arm, "motion_capture")
         # Shapes of logged arrays; the first frame gives the shape of the markers.
         self._shapes: dict[str, tuple[int, ...]] = {"tip_m": (3,), "tip_quaternion": (4,)}
         self._unsure = False  # the arm may have taken the last pressures, but has not confirmed them
@@ -79,17 +75,31 @@ class Link:
         if not self._simulated:
             time.sleep(max(0.0, time_s - time.monotonic()))
 
-    def read(self) -> np.ndarray | None:
-        """Return the readings (n_springs,), or None where they did not come in time.
+    def read(self, time_s: float) -> tuple[np.ndarray | None, dict[str, Any]]:
+        """Return the readings (n_springs,), None where they did not come in time, and a row of the log.
+
+        The row has time, readings, pressures, measured if they are, and motion capture unless it missed.
 
         Raises:
-            ArmFault: the sensors cannot be reached, or their number is another.
+            ArmFault: a method failed, or the shape of an array is another.
         """
+        n_springs, n_chambers = self._spec.n_springs, self._spec.n_chambers
         try:
             readings = self._call("read_sensors", lambda: np.array(self._arm.read_sensors(), float))
+            row = {"readings": self._shaped("read_sensors", readings, (n_springs,))}
         except TimeoutError:
-            return None
-        return self._shaped("read_sensors", readings, (self._spec.n_springs,))
+            readings = None
+            row = {"readings": np.full(n_springs, np.nan)}
+        row |= {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
+        if self.measures:
+            kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
+            row["pressure_kpa"] = self._shaped("pressures", kpa, (n_chambers,))
+            row["commanded_kpa"] = self.pressure_kpa
+        if self.sees:
+            for name, value in self._call("motion_capture", self._frame).items():
+                shape = self._shapes.setdefault(name, value.shape)
+                row[name] = self._shaped(f"motion_capture: {name}", value, shape)
+        return readings, row
 
     def write(self, pressure_kpa: np.ndarray) -> bool:
         """Command pressures (n_chambers,) [kPa]; return whether they were taken in time.
@@ -104,34 +114,14 @@ class Link:
             self._call("write_pressures", lambda: self._arm.write_pressures(pressure_kpa))
         except TimeoutError as error:
             self._n_late += 1
-            most = 2 * LATE_TICKS
-            if self._n_late <= most:
+            if self._n_late <= 2 * LATE_TICKS:
                 return False
-            got = f"got {self._n_late} late in a row, expected {most} at most"
+            got = f"got {self._n_late} late in a row, expected {2 * LATE_TICKS} at most"
             raise ArmFault(f"write_pressures: {got}") from error
         self.pressure_kpa = pressure_kpa
         self._n_late = 0
         self._unsure = False  # last: a signal may come between these lines
         return True
-
-    def look(self, time_s: float) -> dict[str, Any]:
-        """Return a row of the log: time, pressures, and motion capture unless it missed a frame.
-
-        If the arm measures no pressures, the row has the commanded ones; otherwise it has both.
-
-        Raises:
-            ArmFault: a method failed, or the shape of an array changed.
-        """
-        row: dict[str, Any] = {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
-        if self.measures:
-            kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
-            row["pressure_kpa"] = self._shaped("pressures", kpa, (self._spec.n_chambers,))
-            row["commanded_kpa"] = self.pressure_kpa
-        if self.sees:
-            for name, value in self._call("motion_capture", self._frame).items():
-                shape = self._shapes.setdefault(name, value.shape)
-                row[name] = self._shaped(f"motion_capture: {name}", value, shape)
-        return row
 
     def vent(self) -> None:
         """Ramp all pressures to zero, and repeat writes that fail; needs the pumps alone.
@@ -149,8 +139,9 @@ class Link:
                 in_time, why = False, str(error)
             n_failed = 0 if in_time else n_failed + 1
             if n_failed == VENT_TRIES:
-                got = f"got {n_failed} failed writes in a row, expected fewer"
-                raise ArmFault(f"vent: {got}; the last: {why}")
+                raise ArmFault(
+                    f"vent: got {n_failed} failed writes in a row, expected fewer; the last: {why}"
+                )
             self.wait_until(begin_s + self._dt_s)
 
     def _frame(self) -> dict[str, np.ndarray]:

@@ -10,19 +10,16 @@ Belief, strategy and command are values, which `LoopState` holds side by side.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm.control import LawState, pressures
-from mjx_softarm.deploy.belief import Belief, believe
-from mjx_softarm.deploy.controller import Command, Controller
+from mjx_softarm.deploy.belief import Belief, Command, believe
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.safety import Event, Fault, check, stop_of
-from mjx_softarm.deploy.strategy import Strategy, to_fixed_goal
-from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.reach import nearest, nearest_poses
+from mjx_softarm.deploy.safety import Event, check, stop_of
+from mjx_softarm.deploy.strategy import Strategy
 
 
 class LoopState(NamedTuple):
@@ -43,7 +40,6 @@ def start(controller: Controller) -> LoopState:
 
 
 def step(
-    controller: Controller,
     state: LoopState,
     readings: np.ndarray | None,
     late: bool,
@@ -52,7 +48,6 @@ def step(
     """Take one tick.
 
     Args:
-        controller: the policy.
         state: after the last tick; its pressures are in force.
         readings (n_springs,): of the sensors, or None where none came in time.
         late: the last tick missed its deadline.
@@ -79,75 +74,24 @@ def step(
             state = state._replace(command=state.command._replace(reference_m=reference_m, n_ticks=0))
 
     # Pressures
-    command = _pressed(controller, state.command, belief.spring_m)
+    command = _pressed(state.command, belief)
     return state._replace(command=command), events
 
 
-def _pressed(controller: Controller, command: Command, spring_m: np.ndarray) -> Command:
+def _pressed(command: Command, belief: Belief) -> Command:
     """Return the command with the next pressures: the law's; nearer to zero where there are no references."""
+    controller = belief.controller
     if command.reference_m is None:
         lower_kpa = vented(command.pressure_kpa, controller.dt_s)
-        return command._replace(pressure_kpa=lower_kpa, law=LawState.at_rest(lower_kpa, spring_m))
+        return command._replace(pressure_kpa=lower_kpa, law=LawState.at_rest(lower_kpa, belief.spring_m))
     law = command.law
     if np.isnan(law.length_m).any():  # these are the first lengths that were read
-        law = LawState.at_rest(command.pressure_kpa, spring_m)
+        law = LawState.at_rest(command.pressure_kpa, belief.spring_m)
     gains = controller.policy.gains
-    pressure_kpa, law = pressures(command.reference_m, spring_m, law, gains, controller.dt_s)
+    pressure_kpa, law = pressures(command.reference_m, belief.spring_m, law, gains, controller.dt_s)
     return command._replace(pressure_kpa=pressure_kpa, law=law, n_ticks=command.n_ticks + 1)
 
 
 def in_force(state: LoopState, pressure_kpa: np.ndarray) -> LoopState:
     """Return the state with the pressures (n_chambers,) [kPa] that the arm has taken."""
     return state._replace(command=state.command._replace(pressure_kpa=pressure_kpa))
-
-
-def with_goal(
-    controller: Controller, state: LoopState, goal: np.ndarray
-) -> tuple[LoopState, tuple[Event, ...]]:
-    """Return the state with a goal (6,) [mm, deg]; unchanged, with an event, if the goal is refused."""
-    goal = np.asarray(goal, float)
-    text = ", ".join(f"{value:g}" for value in goal)
-    if goal.shape != (6,) or not np.isfinite(goal).all():
-        return state, (Event(Fault.GOAL_OUTSIDE, f"got {text}, expected six finite numbers"),)
-    pose, away = nearest(controller.reachable, goal)
-    if away > 1.0:
-        near = ", ".join(f"{value:.0f}" for value in pose)
-        far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
-        return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
-    strategy = to_fixed_goal(controller.policy)
-    command = state.command._replace(n_ticks=0)
-    return state._replace(goal=goal, ahead=None, strategy=strategy, command=command), ()
-
-
-def hold(state: LoopState) -> LoopState:
-    """Return the state without a goal, the springs held as they were read last.
-
-    An arm without references, which has no pressure or is being vented, stays so.
-    """
-    if state.command.reference_m is None or not state.belief.known:
-        return state._replace(goal=None)
-    held = state.command._replace(reference_m=state.belief.spring_m, n_ticks=0)
-    return state._replace(goal=None, command=held)
-
-
-def release(state: LoopState) -> LoopState:
-    """Return the state without goal and references, in which the pressures go to zero along the ramp."""
-    return state._replace(goal=None, command=state.command._replace(reference_m=None))
-
-
-def refusals(policy: Policy, goals: Sequence[np.ndarray]) -> dict[int, Event]:
-    """Return which goals (6,) [mm, deg] are refused, since no pressures reach them; takes longer than a tick.
-
-    It is sharper than `with_goal`, whose poses lie some 15 mm apart.
-    """
-    finite = [k for k, goal in enumerate(goals) if np.shape(goal) == (6,) and np.isfinite(goal).all()]
-    if not finite:
-        return {}
-    poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
-    refused = {}
-    for k, pose, error in zip(finite, poses, errors, strict=True):
-        if not error <= policy.reward.threshold:
-            got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
-            message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
-            refused[k] = Event(Fault.GOAL_OUTSIDE, message)
-    return refused

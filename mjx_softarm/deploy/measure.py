@@ -46,8 +46,7 @@ def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
     Around the circle the last plate is that of the straight arm, with motion capture's frame as calibrated.
 
     Raises:
-        InputError: there is no such file, or its columns are not `GOAL_COLUMNS`, or the first three of these
-            for a policy whose goals have no rotation.
+        InputError: there is no such file, or it has other columns.
     """
     if name == "circle":
         position_m, _ = frame_from_pose(circle_poses(policy.spec, n).astype(float))
@@ -67,14 +66,16 @@ def whole_goal(goal: Sequence[float], policy: Policy, where: str) -> np.ndarray:
     """Return a goal (6,) [mm, deg] that is given as such, or by its position (3,); then angles do not matter.
 
     Raises:
-        InputError: it is a position, and the policy's goals have a rotation; the message begins with `where`.
+        InputError: it is a position, and the policy's goals have a rotation.
     """
-    if len(goal) == 3 and any(policy.reward.asked[3:]):
+    if len(goal) == 6:
+        return np.array(goal)
+    if any(policy.reward.asked[3:]):
         raise InputError(
             f"{where}: got a position alone, expected X,Y,Z,YAW,PITCH,ROLL: only a policy that was trained "
             "with --env.reward.axes 1 1 1 0 0 0 takes positions"
         )
-    return np.append(goal, straight_pose(policy.spec)[3:]) if len(goal) == 3 else np.array(goal)
+    return np.append(goal, straight_pose(policy.spec)[3:])
 
 
 def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
@@ -140,7 +141,6 @@ def figures(
     A goal is measured if the tip arrived and was seen, at any distance. Translation is the norm of the errors
     of x, y and z, rotation that of yaw, pitch and roll; both leave out axes that goals do not ask for.
     """
-    # Errors at the goals that were measured
     measured = np.isfinite(accuracy.error).all(axis=1)
     n_measured = int(measured.sum())
     error, believed = (
@@ -149,8 +149,6 @@ def figures(
     )
     away, turned = _norms(error, asked)
     per_point = accuracy.saturated.sum(axis=1)
-
-    # Figures of translation, rotation and each axis; of belief, saturation and faults
     return {
         "points": len(accuracy.goal),
         "measured": n_measured,
@@ -188,11 +186,9 @@ def ways_of(run: LoopRun) -> list[Way]:
 
 
 def along(ways: Sequence[Way], dt_s: float) -> dict[str, float]:
-    """Return the tip's distances from a moving goal on one way or more; there is none without a frame.
+    """Return the tip's distances [mm] from a moving goal at the same time, and behind it by a lag.
 
-    Returns:
-        Mean, 95 % and largest distance [mm] of tip and goal at the same time; the lag [s], up to
-        `MOST_LAG_S`, with the least mean distance, and this mean.
+    The lag [s], up to `MOST_LAG_S`, is that with the least mean distance. There is none without a frame.
     """
 
     def away_mm(lag: int) -> np.ndarray:
@@ -220,9 +216,6 @@ def write_accuracy(
     """Write `accuracy.json` and, with matplotlib, `accuracy.png`; return why there is no picture, or "".
 
     The picture shows the ways, if there are any, else the goals at which the arm has come to rest.
-
-    Raises:
-        OSError: a file cannot be written.
     """
     # Figures and the error at each goal
     points = [

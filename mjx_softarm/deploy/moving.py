@@ -22,7 +22,7 @@ from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import asked_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import spring_lag_s
-from mjx_softarm.policy.runtime import InMotion, sensed, tip_pose
+from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.estimator import Frame, estimate, even_pose, expected_springs
 from mjx_softarm.sensing.pose import pose_error
 
@@ -31,9 +31,7 @@ from mjx_softarm.sensing.pose import pose_error
 # second, policies trained at rest oscillate on rods.
 WAY_SHARE_PER_S = 1.0
 
-# Time over which the rate of the references towards a moving goal is taken, for `spring_lag_s`, of policies
-# at rest
-RATE_S = 0.2
+RATE_S = 0.2  # time over which the rate of a moving goal's references is taken, of policies at rest
 
 # Goals that swing between two poses; by hand
 _N_SWINGS = 4
@@ -58,18 +56,15 @@ class ShapeLag(NamedTuple):
 
         Then the springs have lengths (n_springs,) [m], and the arm carries a payload.
         """
-        # A shape without a lag is always that at rest
-        if not policy.spec.shape_lag_s:
+        lag_s = policy.spec.shape_lag_s
+        if not lag_s:
             return self, np.zeros(6)
-        # Difference at rest
         model = policy.estimator
         base = Frame(model.base_position_m, model.base_rotation)
-        pose = estimate(model, spring_m, load_kg)
-        uneven = pose_error(np.asarray(pose, float), even_pose(base, model.spring_site_m, spring_m))
-        # The arm begins at rest
-        if self.uneven is None:
+        pose = np.asarray(estimate(model, spring_m, load_kg), float)
+        uneven = pose_error(pose, even_pose(base, model.spring_site_m, spring_m))
+        if self.uneven is None:  # the arm begins at rest
             return ShapeLag(uneven), np.zeros(6)
-        lag_s = policy.spec.shape_lag_s
         now = self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven)
         return ShapeLag(now), pose_error(uneven, now)
 
@@ -136,7 +131,6 @@ class Predicting(NamedTuple):
     behind: np.ndarray | float = 0.0  # (6,) [mm, deg] pose at rest with the last lengths less that in motion
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Act several times; the last references count."""
         # Lengths at the goal, of an arm whose shape lags and that has been beside its way
         controller = belief.controller
         policy = controller.policy
@@ -147,9 +141,8 @@ class Predicting(NamedTuple):
         goal = goal + self.behind + way.correction
         for _ in range(policy.n_actions):
             length_m = planned(belief, pose, goal + shift)
-            pose, _ = pose_of(controller, length_m, belief.load)
-            left = asked_error(np.asarray(pose, float), goal, policy.reward)
-            shift = clipped(shift - left)
+            pose = pose_of(policy, length_m, belief.load.believed_kg)
+            shift = clipped(shift - asked_error(pose, goal, policy.reward))
         shape, behind = self.shape.advance(policy, length_m, belief.load.believed_kg, controller.dt_s)
 
         # Lengths due now, their rate, and the lag of springs that move so
@@ -173,7 +166,7 @@ class Chasing(NamedTuple):
     shape: ShapeLag = ShapeLag()
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Act from the pose in motion towards the goal, corrected by its error on the way."""
+        # Pose in motion, and the goal corrected by its error on the way
         controller = belief.controller
         load_kg = belief.load.believed_kg
         shape, behind = self.shape.advance(controller.policy, belief.spring_m, load_kg, controller.dt_s)
@@ -200,16 +193,13 @@ def lead_of(controller: Controller) -> tuple[float, float]:
     The second is of whole ticks. For a policy of motion it takes seconds to find them.
     """
     policy = controller.policy
-
-    def whole_ticks(time_s: float) -> float:
-        return round(time_s * policy.rate_hz) / policy.rate_hz
-
     if policy.action_s:
-        lead_s = whole_ticks(max(0.0, tip_lag_s(controller)))
+        lead_s = round(max(0.0, tip_lag_s(controller)) * policy.rate_hz) / policy.rate_hz
         return lead_s, lead_s
     # The rate of the references is known after `RATE_S`, and the actuators have a dead time
     lead_s = float(np.mean(policy.gains.reference_s)) + 0.5 * RATE_S
-    return lead_s, whole_ticks(RATE_S + float(np.mean(policy.spec.actuators.delay_s)))
+    start_s = RATE_S + float(np.mean(policy.spec.actuators.delay_s))
+    return lead_s, round(start_s * policy.rate_hz) / policy.rate_hz
 
 
 def tip_lag_s(controller: Controller) -> float:
@@ -229,7 +219,7 @@ def tip_lag_s(controller: Controller) -> float:
         shares = 0.5 + _SWING * rng.uniform(-1.0, 1.0, (2, policy.spec.n_chambers))
         ends_kpa = low + (high - low) * shares
         ends_m = expected_springs(policy.spring_model, ends_kpa)
-        first, last = (_pose(policy, spring_m) for spring_m in ends_m)
+        first, last = (pose_of(policy, spring_m, 0.0) for spring_m in ends_m)
         swing = pose_error(last, first)
         goals = first + 0.5 * (1.0 - np.cos(phase))[:, None] * swing
         along = _tip_path(controller, ends_kpa[0], goals) @ swing[:3]
@@ -246,10 +236,9 @@ def _tip_path(controller: Controller, pressure_kpa: np.ndarray, goals: np.ndarra
     """
     # The arm at rest
     policy = controller.policy
-    spec = policy.spec
     dt_s = controller.dt_s
-    straight_m = spec.at_chambers(spec.geometry.section_length_m)
-    air = spec.pneumatics(straight_m, dt_s)
+    straight_m = policy.spec.at_chambers(policy.spec.geometry.section_length_m)
+    air = policy.spec.pneumatics(straight_m, dt_s)
     air.hold(pressure_kpa, straight_m)
     spring_m = _springs(policy, pressure_kpa)
     law = LawState.at_rest(pressure_kpa, spring_m)
@@ -261,7 +250,7 @@ def _tip_path(controller: Controller, pressure_kpa: np.ndarray, goals: np.ndarra
     shape = ShapeLag()
     for goal in goals:
         shape, behind = shape.advance(policy, spring_m, 0.0, dt_s)
-        at_rest = _pose(policy, spring_m)
+        at_rest = pose_of(policy, spring_m, 0.0)
         pose = at_rest - behind
         tip_mm.append(pose[:3])
         motion = InMotion(lengths_m[0], references_m[0], law.integral_kpa)
@@ -276,7 +265,3 @@ def _tip_path(controller: Controller, pressure_kpa: np.ndarray, goals: np.ndarra
 
 def _springs(policy: Policy, pressure_kpa: np.ndarray) -> np.ndarray:
     return np.asarray(expected_springs(policy.spring_model, pressure_kpa), float)
-
-
-def _pose(policy: Policy, spring_m: np.ndarray) -> np.ndarray:
-    return np.asarray(tip_pose(policy, spring_m, 0.0)[0], float)

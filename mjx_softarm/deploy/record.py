@@ -1,8 +1,7 @@
 """Record an arm for calibration: poses at rest, and its motion between them. NumPy only; any arm.
 
 A step and a ramp lead from one set of pressures to the next; the step shows how fast the actuators follow.
-Each set is held until the arm is at rest by calibration's rule (`mjx_softarm.logs.rest`). Every tick is
-logged, in the columns of the control loop's log without references, goals and estimates.
+Each set is held until the arm is at rest by calibration's rule (`mjx_softarm.logs.rest`).
 
 From time to time each tip of the second half is predicted from the springs, by a Gaussian process of what
 sections that bend evenly leave: from all other poses, and from the first half alone. Once all others predict
@@ -58,7 +57,6 @@ class PoseRecording(NamedTuple):
     n_poses: int  # number of poses at rest
     n_unsettled: int  # number of poses not seen at rest within TIMEOUT_S
     ending: Ending
-    error_mm: float  # median error of tips that the other poses predict; NaN if unknown
 
 
 def record(
@@ -72,7 +70,7 @@ def record(
 
     Args:
         arm: without pressure, as its driver gives it.
-        spec: the arm, for its rate, its limits and the range of its sensors.
+        spec: of the arm.
         targets_kpa (m, n_chambers) [kPa]: sets of pressures, in order.
         tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.
@@ -80,8 +78,6 @@ def record(
     rows = Recorder()
     rest = []  # whether each pose was seen at rest
     poses = []  # spring lengths and tip [m] of each pose with both
-    error_mm = np.nan
-    n_enough = 0
 
     def on_tick(row: dict) -> None:
         hold.add(row)
@@ -90,10 +86,11 @@ def record(
     drive = Drive(arm, spec, on_tick)
     hold = _Hold(drive)
     step_kpa = STEP_SHARE * (spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa)
-    began_s = reported_s = time.monotonic()
 
     def run() -> None:
-        nonlocal reported_s, error_mm, n_enough
+        began_s = reported_s = time.monotonic()
+        error_mm = np.nan
+        n_enough = 0
         for k, target_kpa in enumerate(targets_kpa, 1):
             # Drive to the pressures, and check the arm.
             hold.ticks.clear()
@@ -124,7 +121,7 @@ def record(
         return rows.log("record", drive.sensor)
 
     ending = vent_at_end(run, drive.link, tell, lambda: save(log()) if len(rows) else None)
-    return PoseRecording(log(), sum(rest), len(rest) - sum(rest), ending, error_mm)
+    return PoseRecording(log(), sum(rest), len(rest) - sum(rest), ending)
 
 
 def prediction_errors_mm(poses: np.ndarray, spec: ArmSpec) -> tuple[float, float]:

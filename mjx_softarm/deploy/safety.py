@@ -26,10 +26,8 @@
                      calibration's limit: the payload believed before stays
 
 Names in capitals are constants, here and where they are imported from. To vent is to end the run and
-bring all pressures to zero along a ramp, as at every end of a run (`mjx_softarm.deploy.ending`). Every fault
-is counted; `Event.message` says what was seen and what was expected.
-
-`check` watches each tick. It may only vent: it neither plans nor drives.
+bring all pressures to zero along a ramp, as at every end of a run (`mjx_softarm.deploy.ending`). `check`
+watches each tick. It may only vent: it neither plans nor drives.
 """
 
 from __future__ import annotations
@@ -177,11 +175,10 @@ def extrapolated(belief: Belief) -> tuple[Event, ...]:
 
 def unsettled(belief: Belief) -> tuple[Event, ...]:
     """Return the faults of the springs as they stand before the next action."""
-    # Errors at the chambers: springs of an arm with redundant chambers cannot all be on any references
     off_m = belief.mean_m - belief.command.reference_m
     kind = "spring"
     allocation = belief.controller.policy.gains.allocation
-    if allocation is not None:
+    if allocation is not None:  # not all springs can be on any references: errors at the chambers count
         off_m = -allocated_error(-off_m, belief.command.pressure_kpa, allocation)
         kind = "chamber"
 

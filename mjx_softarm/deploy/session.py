@@ -39,7 +39,7 @@ class Arrival(NamedTuple):
 
 
 class LoopRun(NamedTuple):
-    """Results of a run of the control loop."""
+    """Results of a run."""
 
     log: Log
     arrivals: tuple[Arrival, ...]
@@ -55,10 +55,7 @@ class LoopRun(NamedTuple):
 
     @property
     def status(self) -> int:
-        """Exit status of the ending; after a good one `MISSED` if a goal was not reached or was refused.
-
-        Goals of `steer` do not count.
-        """
+        """Exit status of the ending; after a good one `MISSED` if a goal was not reached or was refused."""
         n_reached = sum(arrival.reached for arrival in self.arrivals)
         return self.ending.status or (MISSED if n_reached < self.n_goals else DONE)
 
@@ -85,7 +82,7 @@ def follow(
         save: writes the log, once the arm is vented.
         stay: hold the last goal until `duration_s` or something else ends the run.
     """
-    listed = ListedGoals(controller, goals, duration_s, stay)
+    listed = ListedGoals(controller.policy, goals, duration_s, stay)
     return _Session(arm, controller, listed, tell, arrived).to_end(save)
 
 
@@ -133,9 +130,8 @@ def steer(
         look: takes the state after each tick and the row that it logged; may not wait.
         tell, save: as for `follow`.
     """
-    goals = OrderedGoals(controller, orders)
-    kept = None if save else _KEPT
-    session = _Session(arm, controller, goals, tell, look=look, kept=kept)
+    goals = OrderedGoals(controller.policy, orders)
+    session = _Session(arm, controller, goals, tell, look=look, kept=None if save else _KEPT)
     return session.to_end(save or (lambda log: None))
 
 
@@ -164,20 +160,25 @@ class _Session:
         self.arrivals: deque[Arrival] = deque(maxlen=kept)
         self.events: deque[Event] = deque(maxlen=kept)
         self.latency_s: deque[float] = deque(maxlen=kept)
-        self.last: set[Fault] = set()
-        self.late = False
+        self.last: set[Fault] = set()  # faults that were told and last
 
     def to_end(self, save: Callable[[Log], None]) -> LoopRun:
         """Run, vent and save the log; return the results."""
-        ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
-        arrivals = tuple(self.arrivals)
-        events = tuple(self.events)
-        latency_s = np.array(self.latency_s)
+        ending = vent_at_end(self._run, self.link, self.tell, lambda: save(self._log()))
         return LoopRun(
-            self.log(), arrivals, events, latency_s, ending, self.goals.n_goals, tuple(self.goals.ways)
+            self._log(),
+            tuple(self.arrivals),
+            tuple(self.events),
+            np.array(self.latency_s),
+            ending,
+            self.goals.n_goals,
+            tuple(self.goals.ways),
         )
 
-    def run(self) -> None:
+    def _log(self) -> Log:
+        return self.rows.log("run", self.controller.policy.sensor)
+
+    def _run(self) -> None:
         """Go through the goals.
 
         Raises:
@@ -196,6 +197,7 @@ class _Session:
     def _ticks(self) -> Event | None:
         """Take ticks until the goals are over; return the event that ends the run before."""
         dt_s = self.controller.dt_s
+        late = False
         while True:
             begin_s = self.link.now()
             state, refused = self.goals.advance(self.state, begin_s, len(self.rows))
@@ -204,30 +206,25 @@ class _Session:
             if state is None:
                 return None
             self.state = state
-            stop, in_time = self._tick(begin_s)
+            stop, in_time = self._tick(begin_s, late)
             if stop is not None:
                 return stop
-            self.late = not in_time or self.link.now() - begin_s > dt_s + _ROUNDING_S
+            late = not in_time or self.link.now() - begin_s > dt_s + _ROUNDING_S
             self.link.wait_until(begin_s + dt_s)
 
-    def log(self) -> Log:
-        return self.rows.log("run", self.controller.policy.sensor)
-
-    def _tick(self, begin_s: float) -> tuple[Event | None, bool]:
+    def _tick(self, begin_s: float, late: bool) -> tuple[Event | None, bool]:
         """Return the event that ends the run, and whether the arm took the pressures in time."""
         # Read the arm.
         goal = self.state.goal
-        readings = self.link.read()
-        row = self.link.look(begin_s)
-        row["readings"] = self.nothing if readings is None else readings
+        readings, row = self.link.read(begin_s)
         row["goal"] = np.full(6, np.nan) if goal is None else goal
 
         # Take a tick of the loop.
         began = time.perf_counter()
         try:
-            self.state, events = step(self.controller, self.state, readings, self.late, row["pressure_kpa"])
+            self.state, events = step(self.state, readings, late, row["pressure_kpa"])
         except Exception:  # the row that explains it is kept
-            self._log(row)
+            self._add(row)
             raise
         self.latency_s.append(time.perf_counter() - began)
 
@@ -237,14 +234,14 @@ class _Session:
             in_time = stop is not None or self.link.write(self.state.command.pressure_kpa)
             self.state = in_force(self.state, self.link.pressure_kpa)
         finally:  # the row is kept even if the pressures were refused; logging comes after them
-            self._log(row)
+            self._add(row)
             self._note(events, self.state.belief.estimate_kg is not None)
             if self.state.arrived:
                 self._arrive(row["goal"], row["estimate"])
             self.look(self.state, row)
         return stop, in_time
 
-    def _log(self, row: dict[str, Any]) -> None:
+    def _add(self, row: dict[str, Any]) -> None:
         belief = self.state.belief
         reference_m = self.state.command.reference_m
         row["estimate"], row["load_kg"] = belief.pose, belief.load.believed_kg

@@ -41,45 +41,43 @@ class Strategy(Protocol):
     """Interface of a strategy: a value with a memory."""
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Return the references for a goal (6,) [mm, deg], that ahead if it moves, and the next memory."""
+        """Act or wait, towards a goal (6,) [mm, deg], that ahead if it moves."""
         ...
 
 
-# Strategy with its next memory, None: no further action is due; references (n_springs,) [m], None: the last
-# ones stay; faults
+# Strategy with its next memory, None once the springs have settled after the last action; references
+# (n_springs,) [m], None: the last ones stay; faults
 Answer = tuple[Strategy | None, np.ndarray | None, tuple[Event, ...]]
 
 
 class AtRest(NamedTuple):
-    """Actions of a policy for arms at rest: at once, then whenever the springs have settled."""
+    """Actions of a policy for arms at rest: at once, then whenever the springs have settled.
+
+    An action that would lead away from the goal is tried with smaller shifts. Where none will do, the arm has
+    arrived.
+    """
 
     shift: np.ndarray = np.zeros(6)  # [mm, deg]
     n_actions: int = 0
     acted_load: Load | None = None  # payload at the last action
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Act or wait; arrive once the springs have settled after the last action.
-
-        An action that would lead away from the goal is tried with smaller shifts. Where none will do, the arm
-        has arrived.
-        """
-        policy = belief.controller.policy
         # The first action has no shift; the next actions correct the error that it leaves.
-        if not self.n_actions:
-            return self._act(belief, goal, [np.zeros(6)])
-        if _waits(belief, SETTLE_TIMEOUT_S):
-            return self, None, ()
-
-        events = unsettled(belief)
-        if self.n_actions == policy.n_actions:
-            return None, None, events
+        policy = belief.controller.policy
+        shifts = [self.shift]
+        allowed = None
+        events: tuple[Event, ...] = ()
+        if self.n_actions:
+            if _waits(belief, SETTLE_TIMEOUT_S):
+                return self, None, ()
+            events = unsettled(belief)
+            if self.n_actions == policy.n_actions:
+                return None, None, events
 
         # Shifts that take all, or a share, of the error that the references leave. The payload's deflection
         # is compensated once: by the next action of a policy that observes the payload, else by the shift.
         # So for such a policy the error is estimated with the payload of its last action.
-        shifts = [self.shift]
-        allowed = None
-        if belief.settled:
+        if self.n_actions and belief.settled:
             reference_m = belief.command.reference_m
             assert reference_m is not None and self.acted_load is not None
             pose = acted = _pose_made(belief, reference_m, belief.load)
@@ -88,23 +86,14 @@ class AtRest(NamedTuple):
             left = asked_error(acted, goal, policy.reward)
             shifts = [clipped(self.shift - share * left) for share in SHARES]
             allowed = max(float(weighted_error(pose, goal, policy.reward)), policy.reward.threshold)
-        return self._act(belief, goal, shifts, events, allowed)
 
-    def _act(
-        self,
-        belief: Belief,
-        goal: np.ndarray,
-        shifts: list[np.ndarray],
-        events: tuple[Event, ...] = (),
-        allowed: float | None = None,
-    ) -> Answer:
-        """Take the first shift whose references leave a weighted error of at most `allowed`, if given."""
+        # The first shift whose references leave no larger error counts.
         events += extrapolated(belief)
         for shift in shifts:
             reference_m = planned(belief, belief.pose, goal + shift)
             if allowed is not None:
                 pose = _pose_made(belief, reference_m, belief.load)
-                if weighted_error(pose, goal, belief.controller.policy.reward) > allowed:
+                if weighted_error(pose, goal, policy.reward) > allowed:
                     continue
             return AtRest(shift, self.n_actions + 1, belief.load), reference_m, events
         return None, None, events
@@ -119,7 +108,6 @@ class Timed(NamedTuple):
     n_actions: int = 0
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Act or wait; arrive once the springs have settled after the last action."""
         policy = belief.controller.policy
         is_over = self.n_actions == policy.n_actions
         if self.n_actions and _waits(belief, SETTLE_TIMEOUT_S if is_over else policy.action_s):
@@ -140,7 +128,7 @@ def to_fixed_goal(policy: Policy) -> AtRest | Timed:
 def _waits(belief: Belief, timeout_s: float) -> bool:
     """Return True while waiting: not at rest, and no timeout [s] since the last action yet."""
     if belief.settled:
-        return bool(belief.suspect.any())  # whether a chamber is lost comes first
+        return bool(belief.n_suspect.any())  # whether a chamber is lost comes first
     return belief.command.n_ticks * belief.controller.dt_s < timeout_s
 
 
@@ -178,7 +166,7 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
     best_m = belief.spring_m
     for _ in range(1 + N_CORRECTIONS):
         reference_m = controller.plan(belief.pose, goal + shift, belief.spring_m, seen)
-        pose = np.asarray(pose_of(controller, reference_m, belief.load)[0], float)
+        pose = pose_of(policy, reference_m, belief.load.believed_kg)
         error = float(weighted_error(pose, goal, policy.reward))
         if error < least:
             least, best_m = error, reference_m
@@ -189,11 +177,11 @@ def _final_references(belief: Belief, goal: np.ndarray) -> np.ndarray:
 
 def _pose_made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     """Return the pose (6,) [mm, deg] of an arm at rest on its last references, moved to others."""
-    asked_m = belief.command.reference_m
     policy = belief.controller.policy
+    asked_m = belief.command.reference_m
     assert asked_m is not None
     spring_m = followed(reference_m, belief.mean_m, asked_m, belief.saturated, policy)
-    return np.asarray(pose_of(belief.controller, spring_m, load)[0], float)
+    return pose_of(policy, spring_m, load.believed_kg)
 
 
 def clipped(shift: np.ndarray) -> np.ndarray:

@@ -35,8 +35,9 @@ import numpy as np
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.goals import refusals, with_goal
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.loop import in_force, refusals, start, step, with_goal
+from mjx_softarm.deploy.loop import in_force, start, step
 from mjx_softarm.deploy.safety import Event, Fault, stop_of
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import nearest, nearest_poses
@@ -121,7 +122,7 @@ class Machine:
             self.state = in_force(self.state, vented(self._before_kpa, self.controller.dt_s))
         else:
             refused = self._take_goal(row[-6:], checked) if new_goal else ()
-            self.state, raised = step(self.controller, self.state, row[len(FLAGS) : -6], bool(late))
+            self.state, raised = step(self.state, row[len(FLAGS) : -6], bool(late))
             self.stopped = stop_of(raised) is not None
             events, arrived = refused + raised, self.state.arrived
         # Collect the outputs.
@@ -135,7 +136,7 @@ class Machine:
         """Take a goal; return the reasons if it is refused."""
         refused = tuple(refusals(self.controller.policy, [goal]).values()) if checked else ()
         if not refused:
-            self.state, refused = with_goal(self.controller, self.state, goal)
+            self.state, refused = with_goal(self.state, goal)
         return refused
 
 

@@ -89,13 +89,13 @@ def _view(
     from mjx_softarm.view.page import Setup
 
     read = load_policy(on.file)
-    io = on.open(read.spec, tell)
+    io = on.open(read.spec)
     check_arm(io, Controller.of(read), f"--arm {on.arm}")
     hint = HINT if on.file == SHIPPED_TWIN else ""
     setup = Setup(read, on.arm, host, port, hasattr(io, "attach"), demos is not None, hint)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
     status = live(setup, io, tell, *saves).status
-    finish(io, tell)
+    finish(io)
     return status
 
 

@@ -9,29 +9,13 @@ from mjx_softarm.deploy.session import steer
 from tests.linear_arm import CONTROLLER, DT_S, FAR, GOALS, SPRINGS_M, Leaking, LinearArm, read_m
 
 
-class Stop(Exception):
-    """The pilot has had enough."""
-
-
-class Script:
-    """Orders by tick."""
-
-    def __init__(self, orders, n_ticks):
-        self.script, self.n_ticks, self.tick, self.states = orders, n_ticks, -1, []
-
-    def orders(self):
-        self.tick += 1
-        if self.tick == self.n_ticks:
-            raise Stop
-        return self.script.get(self.tick)
-
-    def look(self, state, row):
-        self.states.append(state)
-
-
 def fly(orders, n_ticks, arm=None, **kwargs):
-    arm, pilot = arm or LinearArm(), Script(orders, n_ticks)
-    return arm, pilot, steer(arm, CONTROLLER, pilot.orders, pilot.look, **kwargs)
+    """Orders by tick; after the last tick the pilot fails."""
+    arm, ticks, states = arm or LinearArm(), iter(range(n_ticks)), []
+    run = steer(
+        arm, CONTROLLER, lambda: orders.get(next(ticks)), lambda state, row: states.append(state), **kwargs
+    )
+    return arm, states, run
 
 
 def test_goals_come_and_go():
@@ -78,9 +62,9 @@ def test_vent_lets_the_pressures_go_and_a_goal_brings_them_back():
 
 def test_to_hold_an_arm_without_references_changes_nothing():
     """One that was never moved stays without pressure, and one that is being vented goes on."""
-    _, pilot, run = fly({5: "hold"}, 50)
-    assert pilot.states[-1].command.reference_m is None and not run.log.pressure_kpa.any()
-    _, pilot, run = fly({0: GOALS, 60: "vent", 65: "hold"}, 200)
+    _, states, run = fly({5: "hold"}, 50)
+    assert states[-1].command.reference_m is None and not run.log.pressure_kpa.any()
+    _, _, run = fly({0: GOALS, 60: "vent", 65: "hold"}, 200)
     assert run.log.pressure_kpa[64].any() and not run.log.pressure_kpa[-1].any()
 
 

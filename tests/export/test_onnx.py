@@ -8,7 +8,8 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.loop import start, step, with_goal
+from mjx_softarm.deploy.goals import with_goal
+from mjx_softarm.deploy.loop import start, step
 from mjx_softarm.export import computations
 from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.golden import FLAGS, read_golden
@@ -72,8 +73,8 @@ def test_lost_reading_holds_the_last_length(files, golden, controller):
     assert got[1][3] == np.float32(0.15 + 3 * 0.05 / 8) and np.flatnonzero(got[2]).tolist() == [3]
     # The loop does not act while a reading is lost; with the same lengths read, it asks for the same.
     readings[3] = controller.policy.sensor.readings(last_m)[3]
-    state, _ = with_goal(controller, start(controller), goal)
-    state, _ = step(controller, state, readings, False)
+    state, _ = with_goal(start(controller), goal)
+    state, _ = step(state, readings, False)
     np.testing.assert_allclose(got[0], state.command.reference_m, atol=1e-6)
 
 
@@ -107,11 +108,11 @@ def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
     assert size["pressure_kpa"] == size["integral_kpa"] == [SIX_CHAMBERS.n_chambers]
     # The first two actions of the loop, while the springs swing
     goal = controller.policy.workspace[0].astype(float)
-    state, _ = with_goal(controller, start(controller), goal)
+    state, _ = with_goal(start(controller), goal)
     swing_m = 0.18 + 0.01 * np.sin(0.3 * np.arange(20))[:, None] * np.linspace(0.5, 1.0, N)
     for spring_m in swing_m:
         before, readings = state, controller.policy.sensor.readings(spring_m)
-        state, _ = step(controller, before, readings, False)
+        state, _ = step(before, readings, False)
         if state.strategy.n_actions == 2:
             break
     assert before.strategy.n_actions == 1 and state.strategy.n_actions == 2

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.loop import start, with_goal
+from mjx_softarm.deploy.goals import with_goal
+from mjx_softarm.deploy.loop import start
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.reach import Reachable, clamped, nearest, nearest_poses
 from mjx_softarm.sensing.estimator import estimate
@@ -67,8 +68,8 @@ def test_goal_outside_comes_back_and_is_accepted():
         np.testing.assert_array_equal(clamped(CONTROLLER.reachable, goal), goal)
     far = GOALS[0] + rng.uniform(-1, 1, (50, 6)) * [900, 900, 900, 120, 60, 120]
     for goal in [FAR, *far]:
-        assert with_goal(CONTROLLER, state, goal)[1] or nearest(CONTROLLER.reachable, goal)[1] <= 1.0
-        accepted, events = with_goal(CONTROLLER, state, clamped(CONTROLLER.reachable, goal))
+        assert with_goal(state, goal)[1] or nearest(CONTROLLER.reachable, goal)[1] <= 1.0
+        accepted, events = with_goal(state, clamped(CONTROLLER.reachable, goal))
         assert events == () and accepted.goal is not None
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.deploy.loop import start, with_goal
+from mjx_softarm.deploy.goals import with_goal
+from mjx_softarm.deploy.loop import start
 from mjx_softarm.deploy.session import steer
 from mjx_softarm.view.live import PagePilot, place_poses
 from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm
@@ -53,8 +54,8 @@ def test_goals_are_obeyed_once_somebody_asks_for_motion(pilot, inbox):
 
 def test_goals_are_clamped(pilot, inbox):
     (goal,) = ask(pilot, inbox, follow=True, goal=FAR)
-    assert with_goal(CONTROLLER, start(CONTROLLER), FAR)[1]
-    assert with_goal(CONTROLLER, start(CONTROLLER), goal)[1] == ()
+    assert with_goal(start(CONTROLLER), FAR)[1]
+    assert with_goal(start(CONTROLLER), goal)[1] == ()
 
 
 @pytest.mark.parametrize("button", ["hold", "vent"])
@@ -86,7 +87,7 @@ def test_payloads_and_picking_and_placing_hang_a_mass_to_the_gripper_and_take_it
     goals = ask(pilot, inbox, place=True)[:6]
     state, row, held = start(CONTROLLER), {"time_s": 0.0}, []
     for goal in goals:
-        pilot.look(with_goal(CONTROLLER, state, goal)[0], row)
+        pilot.look(with_goal(state, goal)[0], row)
         pilot.look(state._replace(arrived=True), row)
         held.append(inbox.shown[-1]["look"].payload_kg)
     assert loads == [held[1], 0.0] and held == [0.0, held[1], held[1], held[1], 0.0, 0.0] and held[1] > 0.1

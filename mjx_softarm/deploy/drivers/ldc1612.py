@@ -51,11 +51,11 @@ class LdcSprings:
         self, channels: Sequence[Sequence[int]], drive_current: int = 18, timeout_s: float = 0.008
     ) -> None:
         # Springs by converter
-        for place in channels:
+        self._springs: dict[tuple[int, int], dict[int, int]] = {}
+        for spring, place in enumerate(channels):
             if not isinstance(place, Sequence) or [*map(type, place)] != [int, int, int]:
                 raise ValueError(f"channels: got {place}, expected bus, address and channel of each spring")
-        self._springs: dict[tuple[int, int], dict[int, int]] = {}
-        for spring, (bus, address, channel) in enumerate(channels):
+            bus, address, channel = place
             others = self._springs.setdefault((bus, address), {})
             if channel in others or channel not in range(4):
                 raise ValueError(

@@ -1,13 +1,7 @@
 """Arms by name, and checks before any pressure that an arm is the one of a specification or of a policy.
 
-    package.module:Class   a driver
-    wiring.toml            an arm at a serial line (`mjx_softarm.deploy.drivers.serial_line`)
-    twin:SEED              a twin; `twin:rod:SEED` is a rod; `twin:SEED@ARM` has another arm, as for `--spec`
-
-Options follow a twin's name, in this order. `:pipe300`, or another of `mjx_softarm.mechanics.pipe.PIPES`,
-puts it into a pipe. `:aged` is the same arm some months later: each spring's zero is 1 mm off, and the
-chambers are 5 % softer. `:exact` has all parts as specified, with friction, hysteresis and noise. `:lost4`
-takes the pressure of chamber 4. `:500g` hangs a payload of 500 g on it.
+A name is `package.module:Class`, a driver; `wiring.toml`, an arm at a serial line (`drivers.serial_line`); or
+that of a twin, such as `twin:SEED` (`mjx_softarm.twin.names`).
 """
 
 from __future__ import annotations
@@ -31,27 +25,19 @@ from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.spec import ArmSpec
 
 _TWIN = "mjx_softarm.twin.names"  # imported only when asked for, since it needs MuJoCo
-_METHODS = ("read_sensors", "write_pressures")
 # Deviation of another arm's mean spring length, in mean section lengths; by hand. A payload of 1 kg: 0.05.
 _OTHER_LENGTH = 0.25
 _ANOTHER = "is it another arm, or not yet switched on"
 
 
 def open_arm(name: str) -> Any:
-    """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
-
-    Args:
-        name: a name as this module describes them. A class has no arguments; its module may be in the
-            working directory.
+    """Open an arm by its name, an `ArmIO`; the module of a class may be in the working directory.
 
     Raises:
         InputError: the name is malformed, cannot be imported, or is no arm.
     """
-    # Hardware by its settings
     if name.endswith(".toml") and ":" not in name:
         return _wired(Path(name))
-
-    # A twin
     module_name, _, item = name.partition(":")
     if not module_name or not item:
         raise InputError(f"--arm: got {name!r}, expected twin:SEED, wiring.toml or package.module:Class")
@@ -70,7 +56,8 @@ def open_arm(name: str) -> Any:
         kind = getattr(importlib.import_module(module_name), item)
     except (ImportError, AttributeError) as error:
         raise InputError(f"--arm {name}: got {error}, expected twin:SEED or a class of yours") from error
-    if missing := [method for method in _METHODS if not callable(getattr(kind, method, None))]:
+    methods = ("read_sensors", "write_pressures")
+    if missing := [method for method in methods if not callable(getattr(kind, method, None))]:
         got = f"no method {' or '.join(missing)}"
         raise InputError(f"--arm {name}: got {got}, expected those of deploy.ArmIO")
     try:
@@ -92,12 +79,11 @@ def _wired(path: Path) -> SerialArm:
     if {*tables} != {"arm"} or not isinstance(table, dict) or table.get("driver") != "serial":
         raise InputError(f'{where}: got {tables}, expected the table arm with driver = "serial"')
     # Settings are the class attributes that a class of one's own would have.
-    settings = {key: value for key, value in table.items() if key != "driver"}
     known = SerialArm.__annotations__
-    if unknown := settings.keys() - known:
+    if unknown := table.keys() - known - {"driver"}:
         raise InputError(f"{where}: got {', '.join(sorted(unknown))}, expected some of {', '.join(known)}")
     try:
-        return type("Arm", (SerialArm,), settings)()
+        return type("Arm", (SerialArm,), table)()
     except (OSError, TypeError, ValueError) as error:
         raise InputError(f"{where}: got {type(error).__name__}: {error}") from error
 
@@ -130,7 +116,7 @@ def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
     """Return an arm's readings (n_springs,), None where it could not be read: the run then says why.
 
     Raises:
-        InputError: their number is not the specification's; the message begins with `name`.
+        InputError: their number is not the specification's.
     """
     try:
         readings = np.array(arm.read_sensors(), float)
@@ -148,7 +134,7 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
     """Refuse an arm that is not the policy's, before any pressure: by number, range and lengths of springs.
 
     Raises:
-        InputError: it is another; the message begins with `name`.
+        InputError: it is another.
     """
     # Readings; a run, too, waits LOST_TICKS ticks for them
     policy = controller.policy

@@ -159,16 +159,12 @@ def test_a_bus_that_hangs_does_not_hold_up_the_loop(chips, monkeypatch):
         ([[1, "0x2A", 0]], "expected bus, address and channel"),
         ([(1, 0x2A, 0), (1, 0x2A, 0)], "expected a channel 0 to 3 of its own"),
         ([(2, 0x2A, 0)], "bus 2, address 0x2a: got Remote I/O error"),
+        ([(1, 0x2A, 0)], r"got ids \[21577, 12372\], expected \[21577, 12373\]"),
     ],
 )
 def test_channels_that_are_not_there(channels, message, chips):
+    chips[0].registers[0x7F] = 0x3054  # of another chip
     with pytest.raises((OSError, ValueError), match=message):
         LdcSprings(channels)
-
-
-def test_another_chip_is_refused(chips):
-    chips[0].registers[0x7F] = 0x3054
-    with pytest.raises(OSError, match=r"got ids \[21577, 12372\], expected \[21577, 12373\]"):
-        LdcSprings(AT)
     with pytest.raises(ValueError, match="drive_current: got 32, expected 0 to 31"):
         LdcSprings(AT, 32)
