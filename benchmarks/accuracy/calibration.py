@@ -101,7 +101,7 @@ def regulators_errors(data: Path) -> dict[str, float]:
     for fitted, asked in (tuple(ASU_LOGS), tuple(ASU_LOGS)[::-1]):
         every = np.ones(days[fitted].n_seconds * days[fitted].n_chambers, bool)
         regulator, lag_s, _ = fit_regulator(days[fitted], every, MEASURED, n_sections=2)
-        error = days[asked].errors(days[asked].simulated([regulator]), lag_s)
+        error = days[asked].errors(days[asked].simulated(regulator), lag_s)
         found[f"of {asked}, fitted to {fitted}"] = rms_of(error) / PSI
         off_kpa = tracks[asked].commanded_kpa - tracks[asked].pressure_kpa
         found[f"of {asked}, the commands"] = rms_of(off_kpa) / PSI
