@@ -158,7 +158,7 @@ def _trunk_errors(x: np.ndarray, tip_mm: np.ndarray, train: np.ndarray, test: np
     """Return errors on rows `test` (n,) of polynomials and the mean network, fitted to rows `train` (n,)."""
     linear, cubic = (polynomial(x, tip_mm, train, degree) for degree in (1, 3))
     fits = [fit_network(x[train], (tip_mm - linear)[train], seed) for seed in range(N_NETWORKS)]
-    network = linear + np.mean([correction(fit.network, x) for fit in fits], axis=0)
+    network = linear + np.mean([correction(network, x) for network, _ in fits], axis=0)
     predictions = {"linear": linear, "cubic": cubic, "network": network}
     return {
         name: float(np.sqrt(np.mean(np.sum((predicted - tip_mm)[test] ** 2, axis=1))))
