@@ -121,10 +121,7 @@ def _process(
 def _hysteresis(state: np.ndarray, left_kpa: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pressure (k,) [kPa] of a section's hysteresis, and by how much it is likelier (k,).
 
-    Args:
-        state (n, d): standardised states of the section.
-        left_kpa (n, c): residual pressures.
-        stop (n, k, c): states of the hysteresis with k strokes.
+    Rows are standardised states (n, d), residual pressures (n, c), and states (n, k, c) with k strokes.
     """
     length, noise, covariance = _most_likely(state, left_kpa)
     inverse = np.linalg.inv(kernel(state, state, length) + noise * np.eye(len(state)))

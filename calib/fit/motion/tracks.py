@@ -64,12 +64,9 @@ def has_commands_alone(log: Log) -> bool:
 
 
 def driven_kpa(commanded_kpa: np.ndarray, spring_m: np.ndarray | None, spec: ArmSpec) -> np.ndarray:
-    """Return the pressures (n, c) [kPa] that an arm's actuators make of commands.
+    """Return the pressures (n, c) [kPa] that an arm's actuators make of commands (n, c) of control periods.
 
-    Args:
-        commanded_kpa (n, c) [kPa]: commands of each control period.
-        spring_m (n, n_springs) [m]: spring lengths, for the volumes; None where they are not known.
-        spec: arm with the actuators.
+    Spring lengths (n, n_springs) [m] give the volumes; None where they are not known.
     """
     actuators = spec.actuators.per_chamber(spec.n_chambers)
     offset_kpa = 0.0 if actuators.rest_offset_kpa is None else actuators.rest_offset_kpa
@@ -208,12 +205,9 @@ class Runs:
 
 
 def _delayed(command_kpa: np.ndarray, before_kpa: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """Return the mean commands (n, b, c) in each period after dead times.
+    """Return the mean of commands (n, c) in each period (n, b, c) after dead times (b, c) [periods].
 
-    Args:
-        command_kpa (n, c): command of each period.
-        before_kpa (b, c): command before the first.
-        delay (b, c): dead times, in periods.
+    Commands before the first are `before_kpa` (b, c).
     """
     out = np.empty((len(command_kpa), *delay.shape))
     whole, part = np.divmod(delay, 1.0)
