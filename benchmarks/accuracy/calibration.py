@@ -102,7 +102,7 @@ def regulators_errors(data: Path) -> dict[str, float]:
     for fitted, asked in (tuple(ASU_LOGS), tuple(ASU_LOGS)[::-1]):
         every = np.ones(days[fitted].n_seconds * days[fitted].n_chambers, bool)
         regulator, lag_s, _ = fit_regulator(days[fitted], every, MEASURED, n_sections=2)
-        error = days[asked].errors(days[asked].simulated([regulator]), lag_s)
+        error = days[asked].errors(days[asked].simulated(regulator), lag_s)
         found[f"of {asked}, fitted to {fitted}"] = rms_of(error) / PSI
         off_kpa = tracks[asked].commanded_kpa - tracks[asked].pressure_kpa
         found[f"of {asked}, the commands"] = rms_of(off_kpa) / PSI
@@ -145,7 +145,7 @@ def trunk_errors(logs: Sequence[TrunkLog], held_out: np.ndarray) -> dict[str, fl
     train, test = fresh & ~held_out, fresh & held_out
     linear, cubic = (polynomial(x, tip_mm, train, degree) for degree in (1, 3))
     fits = [fit_network(x[train], (tip_mm - linear)[train], seed) for seed in range(N_NETWORKS)]
-    network = linear + np.mean([correction(fit.network, x) for fit in fits], axis=0)
+    network = linear + np.mean([correction(network, x) for network, _ in fits], axis=0)
     predictions = {"linear": linear, "cubic": cubic, "network": network}
     return {
         name: float(np.sqrt(np.mean(np.sum((predicted - tip_mm)[test] ** 2, axis=1))))

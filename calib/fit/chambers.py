@@ -42,7 +42,7 @@ from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
 from mjx_softarm.mechanics.workspace import pressure_levels
@@ -50,6 +50,8 @@ from mjx_softarm.spec import BONDS, ArmSpec
 
 MIN_POSES = 20
 ENOUGH_POSES = 60  # circles of six stand-ins within 1.2 mm; docs/results/arms-minutes.json
+N_KINDS = 4  # kinds of errors: tip, rotation, springs, markers
+STRAIGHT = 0.2  # excess of one of three chambers over the others in a straight arm, as a share of the range
 MIN_STRAIGHT = 20  # poses of straight arms from which their errors have scales of their own
 HELD_OUT_BLOCK = 5  # poses
 SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # first guess for tip [m], rotation [rad], springs [m] and markers [m]
@@ -58,6 +60,8 @@ MAX_RATIO = 2.0  # warn from this ratio of calibrated to specified values, or of
 NOTED_TURN_DEG = 1.0  # turn of the measured tip from which there is a note
 MAX_PRESSURE_GAP = 0.1  # share of the pressure range that may be missing at either end
 MAX_OFF_PLATE_M = 0.01  # distance of the last marker from the tip's plate, at most
+BATCH = 128  # poses simulated together
+N_WORKSPACE = 256  # poses over the workspace
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +103,6 @@ class ChamberFit:
         )
 
 
-BATCH = 128  # poses simulated together
-N_KINDS = 4  # kinds of errors: tip, rotation, springs, markers
-N_WORKSPACE = 256  # poses over the workspace
-STRAIGHT = 0.2  # excess of one of three chambers over the others in a straight arm, as a share of the range
-
-
 class Measured(NamedTuple):
     """Measurements of an arm at one pose at rest, with a leading axis at several; NaN where not measured."""
 
@@ -140,9 +138,12 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         settled = settle_pressures(arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa))
         frames = chain_kinematics(arm)(settled.q)
         turn = measured.tip_rotation.T @ settled.tip_rotation
-        end_m = _end_places(frames, marker_sites(x, arm))
-    # Compare it with the measured pose.
+    # Compare it with the measured pose; markers are on the sections' last plates.
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    site_m = marker_sites(x, arm)
+    step = (len(frames.plate_position) - 1) // len(site_m)
+    position, rotation = frames.plate_position[step::step], frames.plate_rotation[step::step]
+    end_m = position + jnp.sum(rotation * site_m[:, None], axis=-1)
     error = [
         settled.tip_position_m - measured.tip_m,
         angle,
@@ -168,29 +169,8 @@ def error_groups(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
     return kind + N_KINDS * straight
 
 
-def _end_places(frames: Frames, site_m: Array) -> Array:
-    """Return the places (n_sections, 3) [m] of sites (n_sections, 3) [m] on the sections' last plates."""
-    step = (len(frames.plate_position) - 1) // len(site_m)
-    position, rotation = frames.plate_position[step::step], frames.plate_rotation[step::step]
-    return position + jnp.sum(rotation * site_m[:, None], axis=-1)
-
-
-def unmeasured(
-    spec: ArmSpec, pressure_kpa: np.ndarray, payload_kg: np.ndarray, tip_rotation: np.ndarray
-) -> Measured:
-    """Return n poses to simulate that nobody measured: zeros but for the axes of the tip."""
-    n, n_sections = len(payload_kg), spec.structure.n_sections
-    tip_m, spring_m, end_m = np.zeros((n, 3)), np.zeros((n, spec.n_springs)), np.zeros((n, n_sections, 3))
-    return Measured(pressure_kpa, payload_kg, tip_m, tip_rotation, spring_m, end_m)
-
-
 def simulate(spec: ArmSpec, measured: Measured, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate all poses at x.
-
-    Args:
-        spec: arm at x = 0.
-        measured: n poses.
-        x (p,): see `calib.fit.parameters`.
+    """Simulate n poses of an arm, `spec` at x = 0, at x (p,).
 
     Returns:
         Errors (n, m) of `residuals`, inf where the arm does not settle; their Jacobian (n, m, p).
@@ -215,12 +195,17 @@ def tip_changes(spec: ArmSpec, x: np.ndarray, change: np.ndarray) -> np.ndarray:
     Returns:
         Lengths (k,) [m].
     """
-    rng = np.random.default_rng(0)
-    extremes = rng.choice(pressure_levels(spec), (N_WORKSPACE // 2, spec.n_chambers))
-    pressure_kpa = np.concatenate([random_pressures(spec, N_WORKSPACE - len(extremes), rng), extremes])
-    payload_kg = np.where(np.arange(N_WORKSPACE) % 2, spec.mass.largest_payload_kg, 0.0)
-    rotation = np.broadcast_to(np.eye(3), (N_WORKSPACE, 3, 3))
-    error, slope = simulate(spec, unmeasured(spec, pressure_kpa, payload_kg, rotation), x)
+    rng, n = np.random.default_rng(0), N_WORKSPACE
+    extremes = rng.choice(pressure_levels(spec), (n // 2, spec.n_chambers))
+    poses = Measured(
+        pressure_kpa=np.concatenate([random_pressures(spec, n - len(extremes), rng), extremes]),
+        payload_kg=np.where(np.arange(n) % 2, spec.mass.largest_payload_kg, 0.0),
+        tip_m=np.zeros((n, 3)),
+        tip_rotation=np.broadcast_to(np.eye(3), (n, 3, 3)),
+        spring_m=np.zeros((n, spec.n_springs)),
+        end_m=np.zeros((n, spec.structure.n_sections, 3)),
+    )
+    error, slope = simulate(spec, poses, x)
     settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))
     return np.linalg.norm(slope[settled, :3] @ change, axis=1).max(axis=0, initial=0.0)
 

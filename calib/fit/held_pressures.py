@@ -65,15 +65,15 @@ def fit_held_pressures(
     held_out = held_out_blocks(len(left_kpa), block=HELD_OUT_BLOCK, seed=seed)
     judged = _process(spec, *(x[~held_out] for x in rows))
     predicted = residual(judged, spring_m[held_out], simulated_kpa[held_out])
-    known_kpa = hysteresis_kpa(spec, judged, spring_m)[held_out] + predicted.mean_kpa.reshape(
-        -1, spec.n_chambers
-    )
-    after_kpa = left_kpa[held_out] - known_kpa
+    before_kpa = left_kpa[held_out]
+    known_kpa = hysteresis_kpa(spec, judged, spring_m)[held_out]
+    known_kpa = known_kpa + predicted.mean_kpa.reshape(before_kpa.shape)
     variance = predicted.share[..., None] * np.diagonal(judged.covariance_kpa2, axis1=1, axis2=2)
-    # Fit to all poses.
-    process = _process(spec, *rows)
     return PressureFit(
-        process, rms_of(left_kpa[held_out]), rms_of(after_kpa), float(np.sqrt(variance.mean()))
+        held=_process(spec, *rows),
+        before_kpa=rms_of(before_kpa),
+        after_kpa=rms_of(before_kpa - known_kpa),
+        expected_kpa=float(np.sqrt(variance.mean())),
     )
 
 
@@ -121,10 +121,7 @@ def _process(
 def _hysteresis(state: np.ndarray, left_kpa: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pressure (k,) [kPa] of a section's hysteresis, and by how much it is likelier (k,).
 
-    Args:
-        state (n, d): standardised states of the section.
-        left_kpa (n, c): residual pressures.
-        stop (n, k, c): states of the hysteresis with k strokes.
+    Rows are standardised states (n, d), residual pressures (n, c), and states (n, k, c) with k strokes.
     """
     length, noise, covariance = _most_likely(state, left_kpa)
     inverse = np.linalg.inv(kernel(state, state, length) + noise * np.eye(len(state)))

@@ -65,12 +65,7 @@ class Solution(NamedTuple):
 
 
 def fit(model: Model, problem: Problem) -> Solution:
-    """Minimise Huber's loss of the errors over their scales, started from x = 0.
-
-    Args:
-        model: errors and their Jacobian.
-        problem: scales and prior.
-    """
+    """Minimise Huber's loss of the errors over their scales, started from x = 0."""
     model = _remembering(model)
     x, scale = np.zeros(len(problem.prior)), problem.scale
     for loss in ROUNDS:
@@ -112,23 +107,32 @@ def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
         x = solution.x + solution.newton_step
         linearised = model(x)
         # Close to the minimum single precision hides changes of the loss, so the gradient decides.
-        if not _covariance(*linearised, x, solution.scale, problem)[2] < solution.decrement:
+        if not solution_at(x, *linearised, problem, solution.scale).decrement < solution.decrement:
             break
         solution = solution_at(x, *linearised, problem)
     return solution
 
 
-def solution_at(x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem: Problem) -> Solution:
-    """Return scales and covariance of a fit that ended at x.
+def solution_at(
+    x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem: Problem, scale: np.ndarray | None = None
+) -> Solution:
+    """Return the solution of a fit that ended at x (p,), with errors (n, m) and their Jacobian (n, m, p).
 
-    Args:
-        x (p,): parameters at the end.
-        error (n, m), jacobian (n, m, p): errors at x, in m columns, and their derivatives.
-        problem: priors and scales of the fit.
+    Scales (n_groups,) are by default those of the errors.
     """
-    scale = _scales(error, problem)
-    covariance, newton_step, decrement = _covariance(error, jacobian, x, scale, problem)
-    return Solution(x, covariance, scale, newton_step, decrement)
+    scale = _scales(error, problem) if scale is None else scale
+    error, slope = _scaled(error, jacobian, scale, problem)
+    precision = np.diag(problem.prior**-2.0)
+    inside = np.where(np.abs(error)[..., None] <= problem.huber, slope, 0.0)
+    curvature = np.swapaxes(inside, 1, 2) @ inside  # (n, p, p) of each row's loss
+    score = np.einsum("nmp,nm->np", slope, np.clip(error, -problem.huber, problem.huber))
+    hessian = curvature.sum(axis=0) + precision
+    change = np.linalg.solve(hessian - curvature, score[..., None])[..., 0]  # (n, p) without each row
+    inverse = np.linalg.inv(hessian)
+    covariance = change.T @ change + inverse @ precision @ inverse
+    gradient = score.sum(axis=0) + precision @ x
+    newton_step = -inverse @ gradient
+    return Solution(x, covariance, scale, newton_step, -0.5 * float(gradient @ newton_step))
 
 
 def rms_of(values: np.ndarray) -> float:
@@ -136,27 +140,11 @@ def rms_of(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))
 
 
-def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Fit y (n, m) as a linear function of x (n, k), with a prior as strong as some rows without a slope.
-
-    Returns:
-        Slopes (k, m) and offsets (m,).
-    """
-    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
-    x, y = x - x_mean, y - y_mean
-    slope = np.linalg.solve(x.T @ x + strength * np.eye(x.shape[1]), x.T @ y)
-    return slope, y_mean - x_mean @ slope
-
-
 def principal(solution: Solution, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions of x from the least known to the best known.
-
-    Args:
-        solution: result of a fit.
-        tolerance (p,): error within which each parameter counts as known.
+    """Return directions of x from the least known to the best known, in units of a tolerance (p,).
 
     Returns:
-        Half-widths (p,) of the 95 % intervals in units of the tolerance; directions (p, p) in its columns.
+        Half-widths (p,) of the 95 % intervals; directions (p, p) in its columns.
     """
     values, vectors = np.linalg.eigh(solution.covariance / np.outer(tolerance, tolerance))
     return QUANTILE * np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
@@ -171,24 +159,6 @@ def _scaled(
     known = np.isfinite(error) & answered
     scaled = np.where(answered, np.where(known, error, 0.0) / sigma, NO_ANSWER)
     return scaled, np.where(known[..., None], jacobian, 0.0) / sigma[..., None]
-
-
-def _covariance(
-    error: np.ndarray, jacobian: np.ndarray, x: np.ndarray, scale: np.ndarray, problem: Problem
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the covariance (p, p), the Newton step (p,) and the decrement of the loss by it."""
-    error, slope = _scaled(error, jacobian, scale, problem)
-    precision = np.diag(problem.prior**-2.0)
-    inside = np.where(np.abs(error)[..., None] <= problem.huber, slope, 0.0)
-    curvature = np.swapaxes(inside, 1, 2) @ inside  # (n, p, p) of each row's loss
-    score = np.einsum("nmp,nm->np", slope, np.clip(error, -problem.huber, problem.huber))
-    hessian = curvature.sum(axis=0) + precision
-    change = np.linalg.solve(hessian - curvature, score[..., None])[..., 0]  # (n, p) without each row
-    inverse = np.linalg.inv(hessian)
-    gradient = score.sum(axis=0) + precision @ x
-    newton_step = -inverse @ gradient
-    covariance = change.T @ change + inverse @ precision @ inverse
-    return covariance, newton_step, -0.5 * float(gradient @ newton_step)
 
 
 def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:

@@ -97,9 +97,8 @@ def names(spec: ArmSpec) -> list[str]:
 
 def without_effect(spec: ArmSpec) -> list[str]:
     """Return which fields of chambers have patterns around a section that change nothing."""
-    n = spec.structure.n_sections * spec.structure.chambers_per_section
     each = zip(FIELDS, BLOCKS, strict=False)  # the first blocks are those of the chambers
-    return [field for field, block in each if _size(block, spec.structure) < n]
+    return [field for field, block in each if _size(block, spec.structure) < spec.n_chambers]
 
 
 def _size(block: Block, structure: Structure) -> int:

@@ -42,12 +42,7 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import arms_at_once, settle
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.sensing.held_pressures import (
-    HeldPressures,
-    covariances,
-    factor_covariance,
-    residual,
-)
+from mjx_softarm.sensing.held_pressures import HeldPressures, covariances, factor_covariance, residual
 from mjx_softarm.sensing.load import COMMON_FACTOR, N_PASSES, QUANTILE
 from mjx_softarm.sensing.s2r import S2R, corrected
 
@@ -88,12 +83,7 @@ def held_at(arm: CalibratedArm, spring_m: np.ndarray) -> tuple[PayloadPoses, np.
 
 
 def effect_of_s2r(arm: CalibratedArm, spring_m: np.ndarray) -> np.ndarray:
-    """Return by how much S2R changes the effect (m, n_chambers) [kPa / kg] of a payload; 0 without S2R.
-
-    Args:
-        arm: calibrated arm.
-        spring_m (m, n_springs) [m]: spring lengths.
-    """
+    """Return by how much S2R changes the effect (m, n_chambers) [kPa / kg] of a payload; 0 without S2R."""
     spec, s2r = arm.spec, arm.s2r
     if s2r is None:
         return np.zeros((len(spring_m), spec.n_chambers))
@@ -126,22 +116,20 @@ def _height_m(frame: tuple[Array, Array], params: ArmParams) -> Array:
     return position_m[2] - params.tool_offset_m[-1] * axis[2]
 
 
-def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float) -> np.ndarray:
-    """Return half-widths (m,) [kg] of the 95 % intervals of a payload at poses."""
-    effect = at.effect_kpa_per_kg
-    covariance = _covariance(held, at, np.full(len(effect), payload_kg))
-    information = np.einsum("mi,mi->m", effect, np.linalg.solve(covariance, effect[..., None])[..., 0])
-    return QUANTILE / np.sqrt(information)
-
-
 def payload_intervals(held: HeldPressures, at: PayloadPoses, largest_kg: float) -> tuple[float, float]:
     """Return the accuracy of payloads over the workspace, as half-widths [kg] of 95 % intervals.
 
     Returns:
         Median over the poses without a payload; 95 % of the poses with the largest payload have less.
     """
-    none, largest = (payload_half_widths(held, at, kg) for kg in (0.0, largest_kg))
-    return float(np.median(none)), float(np.quantile(largest, 0.95))
+
+    def half_widths(payload_kg: float) -> np.ndarray:
+        effect = at.effect_kpa_per_kg
+        covariance = _covariance(held, at, np.full(len(effect), payload_kg))
+        information = np.einsum("mi,mi->m", effect, np.linalg.solve(covariance, effect[..., None])[..., 0])
+        return QUANTILE / np.sqrt(information)
+
+    return float(np.median(half_widths(0.0))), float(np.quantile(half_widths(largest_kg), 0.95))
 
 
 def estimated_payload(
@@ -157,7 +145,7 @@ def estimated_payload(
         pressure_kpa (m, n_chambers) [kPa]: measured pressures.
     """
     (at, _), held = held_at(arm, spring_m), arm.held
-    assert held is not None  # `payloads` of `calib.steps` sees to it
+    assert held is not None
     effect, predicted = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
     left_kpa = pressure_kpa - at.pressure_kpa - predicted.mean_kpa.reshape(effect.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
@@ -191,7 +179,7 @@ def fit_payload_scale(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) 
         rows (k,): indices of `MIN_WEIGHED` poses or more with weights of `LEAST_WEIGHT` or more.
     """
     spec, held = arm.spec, arm.held
-    assert held is not None  # `payloads` of `calib.steps` sees to it
+    assert held is not None
     # Estimate the weights from the pressures that remain
     weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
     kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)

@@ -28,9 +28,8 @@ from jax import Array
 from scipy.linalg import block_diag
 
 from calib.fit.blocks import block_rows, held_out_blocks
-from calib.fit.leastsquares import ridge
 from calib.fit.pose_errors import PoseErrors, pose_errors
-from calib.fit.section_process import Sections, fit_process, predict, sections
+from calib.fit.section_process import Sections, fit_process, sections
 from mjx_softarm._support import xla
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.training import Schedule, initial_layers, train_network
@@ -61,8 +60,6 @@ GOOD_SHARE = 0.1  # share of the error without the network below which there is 
 BATCH = 512  # poses simulated together
 N_POINTS = 24_000  # simulated arms at random pressures, at which the network learns the model
 PROCESS, PRINTED_NETWORK = "Gaussian process of the sections", "network as printed in the paper"
-
-
 RIDGE = 1.0  # prior of the linear map: as strong as a row or two, as inputs are from -1 to 1
 N_ANCHORS = 256
 LIMIT_PERCENTILE = 99.0
@@ -86,31 +83,25 @@ OF_PROCESS = NetworkConfig((192, 192), Schedule(12_000, 4e-3, 512))
 PRINTED = NetworkConfig((64, 64), Schedule(3_000, 0.01, 128, last_share=1.0), line=False)
 
 
-class NetworkFit(NamedTuple):
-    """Fitted network, and the course of its training."""
-
-    network: S2R
-    stop_epoch: int  # epoch whose weights were best on the rows that stop the training
-    n_epochs: int
-
-
 def fit_network(
     x: np.ndarray,
     y: np.ndarray,
     seed: int,
-    config: NetworkConfig | None = None,
+    config: NetworkConfig = OF_ROWS,
     points: tuple[np.ndarray, np.ndarray] | None = None,
-) -> NetworkFit:
+) -> tuple[S2R, np.ndarray]:
     """Fit a network from inputs to outputs by mean squared error.
 
     Args:
         x (n, n_in): inputs in order of time, without the rows that will test the network.
         y (n, n_out): outputs.
         seed: seed of weights, batches and blocks.
-        config: hidden layers and training; by default `OF_ROWS`, or `OF_PROCESS` with points.
+        config: hidden layers and training.
         points: inputs (m, n_in) and outputs (m, n_out) without noise, which it learns in place of the rows.
+
+    Returns:
+        Network; losses (n_epochs,) on the rows that stop the training, of which it has the least.
     """
-    config = config or (OF_ROWS if points is None else OF_PROCESS)
     # Bring the inputs to -1 to 1, and choose anchors.
     bounds = _bounds(x, y)
     low, high = bounds["input_low"], bounds["input_high"]
@@ -123,16 +114,19 @@ def fit_network(
     if points is not None:
         z, y, stop = np.clip(normalised(points[0]), -1.0, 1.0), points[1], None
     # Fit a linear map, then a network to its residual.
-    linear = ridge(z, y, RIDGE)[0] if config.line else np.zeros((z.shape[1], y.shape[1]))
+    linear = np.zeros((z.shape[1], y.shape[1]))
+    if config.line:
+        centred, about = z - z.mean(axis=0), y - y.mean(axis=0)
+        linear = np.linalg.solve(centred.T @ centred + RIDGE * np.eye(len(linear)), centred.T @ about)
     left = y - z @ linear
     centre, spread = left.mean(axis=0), left.std(axis=0)
     spread = np.where(spread > 0.0, spread, 1.0)
-    rows = (np.asarray(z, np.float32), np.asarray((left - centre) / spread, np.float32))
+    rows = z, ((left - centre) / spread).astype(np.float32)
     key_layers, key_rows = jax.random.split(jax.random.key(seed))
     start = initial_layers(key_layers, (z.shape[1], *config.hidden, y.shape[1]))
     layers, losses = train_network(_loss, start, rows, config.schedule, key_rows, stop)
-    network = S2R(_with_line(layers, spread, centre, linear), **bounds, anchors=anchors, limit=limit)
-    return NetworkFit(network, int(losses.argmin()), len(losses))
+    layers = _with_line(layers, spread, centre, linear)
+    return S2R(layers, **bounds, anchors=anchors, limit=limit), losses
 
 
 def _loss(layers: tuple[Layer, ...], rows: tuple[Array, Array]) -> Array:
@@ -153,14 +147,9 @@ def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
 def _with_line(
     layers: tuple[Layer, ...], scale: np.ndarray, offset: np.ndarray, linear: np.ndarray
 ) -> tuple[Layer, ...]:
-    """Return a network of `scale` times another's outputs, plus `offset`, plus a linear map of the inputs.
+    """Return a network of a network's outputs times `scale` plus `offset` (n_out,), plus a linear map.
 
     The inputs z are -1 or more, so z + 1 passes through the rectified layers unchanged.
-
-    Args:
-        layers: layers of the other network.
-        scale, offset (n_out,): scale and offset of its outputs.
-        linear (n_in, n_out): weights of the linear map.
     """
     *hidden, (weight, bias) = layers
     n_in = len(linear)
@@ -235,14 +224,10 @@ class S2RFit:
 
 
 def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
-    """Settle the simulated arm at spring lengths under the sensor-space law, without pressure limits.
+    """Settle the simulated arm at lengths (n, n_springs) [m] under the sensor-space law, n at least 1.
 
     The real arm had these lengths, so the simulated arm must reach them, too. Its own pressure limits would
     often keep it from them, and hide the difference to be learned.
-
-    Args:
-        spec: calibrated arm.
-        reference_m (n, n_springs) [m]: spring lengths of the real arm, finite, n at least 1.
     """
     settled = functools.partial(_solver(arms_at_once(spec.n_links)), without_limits(spec))
     return xla.in_batches(settled, BATCH, reference_m)
@@ -270,7 +255,6 @@ def fit_s2r(
     simulated: SimulatedPoses,
     pose_real: np.ndarray,
     seed: int = 0,
-    config: NetworkConfig | None = None,
     printed: bool = False,
 ) -> S2RFit:
     """Fit a network from simulated poses and spring lengths to real poses.
@@ -280,7 +264,6 @@ def fit_s2r(
         simulated: its n poses from `simulate_poses`, settled ones only, in order of time.
         pose_real (n, 6) [mm, deg]: measured poses in the base frame.
         seed: seed of all random draws.
-        config: training settings.
         printed: fit the paper's network in place of the process.
     """
     n = len(simulated.pose)
@@ -292,25 +275,25 @@ def fit_s2r(
     rows = simulated.take(~held_out)
     model = fit_printed(rows, pose_real[~held_out], seed) if printed else _process(rows, y[~held_out])
     points = _points(spec, model, spring_m[~held_out], seed)
-    fit = fit_network(x[~held_out], y[~held_out], seed, config, points)
+    network, losses = fit_network(x[~held_out], y[~held_out], seed, OF_PROCESS, points)
     # Judge it by the held-out rows.
-    corrected = correct(fit.network, pose_sim, spring_m)
+    corrected = correct(network, pose_sim, spring_m)
     errors = {
         "in_sample": pose_errors(corrected[~held_out], pose_real[~held_out]),
         "test": pose_errors(corrected[held_out], pose_real[held_out]),
         "test_uncorrected": pose_errors(pose_sim[held_out], pose_real[held_out]),
     }
     by_model = moved(pose_sim[held_out], model(simulated.take(held_out)))
-    flagged = extrapolation(fit.network, pose_sim[held_out], spring_m[held_out]) > 1.0
+    flagged = extrapolation(network, pose_sim[held_out], spring_m[held_out]) > 1.0
     turn_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(y[:, 3:], axis=1)))
     return S2RFit(
-        s2r=fit.network._replace(error_mm=np.float32(errors["test"].translation_mean_mm)),
+        s2r=network._replace(error_mm=np.float32(errors["test"].translation_mean_mm)),
         held_out=held_out,
         **errors,
         model=PRINTED_NETWORK if printed else PROCESS,
         test_model=pose_errors(by_model, pose_real[held_out]),
-        stop_epoch=fit.stop_epoch,
-        n_epochs=fit.n_epochs,
+        stop_epoch=int(losses.argmin()),
+        n_epochs=len(losses),
         flagged_share=float(flagged.mean()),
         warnings=tuple(_warnings(n, turn_deg, errors)),
     )
@@ -319,7 +302,7 @@ def fit_s2r(
 def _process(simulated: SimulatedPoses, y: np.ndarray) -> Model:
     """Fit the process of the sections to corrections y (n, 6) of simulated poses."""
     process = fit_process(simulated.sections, y)
-    return lambda simulated: predict(process, simulated.sections)
+    return lambda simulated: process(simulated.sections)
 
 
 def fit_printed(simulated: SimulatedPoses, pose_real: np.ndarray, seed: int = 0) -> Model:
@@ -334,7 +317,7 @@ def fit_printed(simulated: SimulatedPoses, pose_real: np.ndarray, seed: int = 0)
 
     pose = np.asarray(simulated.pose, float)
     near = pose + pose_error(np.asarray(pose_real, float), pose)
-    network = fit_network(inputs(simulated), near, seed, PRINTED).network
+    network, _ = fit_network(inputs(simulated), near, seed, PRINTED)
     return lambda simulated: correction_between(
         np.asarray(simulated.pose, float), np.asarray(correction(network, inputs(simulated)), float)
     )

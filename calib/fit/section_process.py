@@ -17,6 +17,7 @@ Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Pres
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -45,30 +46,13 @@ class Sections(NamedTuple):
     effect: np.ndarray | Array  # (n, s, 6, 6) tip's movement by a movement of a middle
     lever_mm: np.ndarray | Array  # (n,) half of the longest section's length
 
-    def take(self, rows: np.ndarray) -> Sections:
-        """Return some of the arms, chosen by indices or a mask (n,)."""
-        return Sections(*(values[rows] for values in self))
-
-
-class SectionProcess(NamedTuple):
-    """Mean of a process given n rows."""
-
-    rows: Sections
-    length: float  # distance of states over which the correction changes
-    weight: np.ndarray  # (n, s, 6) weight of each row at its sections
-
 
 def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
-    """Return states and effects (s, ...) of the sections of one arm.
+    """Return states and effects (s, ...) of the sections of one arm with springs (n_springs,) [m].
 
     A state holds spring lengths in quarters of the section's length, the vertical in the section's axes, and
     the moment of the weights below, in units of the whole arm's weight half the section's length aside. More
     than three springs, which measure no more than three do, weigh as much as three.
-
-    Args:
-        frames: plates and joints of the arm at rest.
-        params: numbers of the arm.
-        spring_m (n_springs,) [m]: spring lengths.
     """
     # Find the plate in the middle of each section, and the moment of the weights below it.
     n_sections, length_m = params.n_sections, params.section_length_m
@@ -94,10 +78,13 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
     return Sections(jnp.concatenate([stretched, rotation[:, 2, :], local], axis=1), effect, lever_mm)
 
 
-def fit_process(rows: Sections, y: np.ndarray) -> SectionProcess:
+def fit_process(rows: Sections, y: np.ndarray) -> Callable[[Sections], np.ndarray]:
     """Fit a process to the corrections y (n, 6) [mm, Gibbs vector] of n simulated tips.
 
     At most `MAX_ROWS` rows take part, evenly spread.
+
+    Returns:
+        Function from m simulated arms to the mean (m, 6) [mm, Gibbs vector] of the process.
     """
     rows, y = _some(Sections(*(np.asarray(values, float) for values in rows)), y, MAX_ROWS)
     few, few_y = _some(rows, y, MAX_GRID_ROWS)
@@ -107,21 +94,20 @@ def fit_process(rows: Sections, y: np.ndarray) -> SectionProcess:
     )
     weight, _ = solve(_covariance(rows, rows, length), noise, (y * _units(rows)).ravel())
     at_sections = np.einsum("nsji,nj->nsi", rows.effect, weight.reshape(len(y), N_OUTPUTS))
-    return SectionProcess(rows, length, at_sections)
 
+    def predict(at: Sections) -> np.ndarray:
+        mean = np.zeros((len(at.state), N_OUTPUTS))
+        for s in range(at.state.shape[1]):
+            likeness = _likeness(at.state[:, s], rows.state[:, s], length)
+            mean += np.einsum("nij,nj->ni", at.effect[:, s], likeness @ at_sections[:, s])
+        return mean / _units(at)
 
-def predict(process: SectionProcess, at: Sections) -> np.ndarray:
-    """Return the mean (m, 6) [mm, Gibbs vector] for m simulated arms."""
-    mean = np.zeros((len(at.state), N_OUTPUTS))
-    for s in range(at.state.shape[1]):
-        likeness = _likeness(at.state[:, s], process.rows.state[:, s], process.length)
-        mean += np.einsum("nij,nj->ni", at.effect[:, s], likeness @ process.weight[:, s])
-    return mean / _units(at)
+    return predict
 
 
 def _some(rows: Sections, y: np.ndarray, n: int) -> tuple[Sections, np.ndarray]:
     chosen = np.linspace(0, len(y) - 1, min(n, len(y))).round().astype(int)
-    return rows.take(chosen), y[chosen]
+    return Sections(*(values[chosen] for values in rows)), y[chosen]
 
 
 def _covariance(a: Sections, b: Sections, length: float) -> np.ndarray:

@@ -172,15 +172,7 @@ def _fit_all() -> Callable[..., tuple[Array, Array]]:
 
 
 def _fit_one(x: Array, y: Array, known: Array) -> tuple[Array, Array]:
-    """Fit one line.
-
-    Args:
-        x, y (n,): a column; y has unit spread.
-        known (n,) bool: entries that take part.
-
-    Returns:
-        Slope () and offset ().
-    """
+    """Return slope () and offset () of the line of y by x (n,) at the known entries; y has unit spread."""
     count = jnp.maximum(known.sum(), 1)
     mean = jnp.sum(known * x) / count
     spread = jnp.sqrt(jnp.maximum(jnp.sum(known * (x - mean) ** 2) / count, 1e-300))

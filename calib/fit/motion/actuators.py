@@ -23,14 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib.fit.blocks import held_out_blocks
-from calib.fit.leastsquares import (
-    Model,
-    Problem,
-    Solution,
-    descend,
-    refine,
-    rms_of,
-)
+from calib.fit.leastsquares import SIGMA_PER_MEDIAN, Model, Problem, Solution, descend, refine, rms_of
 from calib.fit.motion.tracks import Runs, Track
 from mjx_softarm.pneumatics import LONGEST_DELAY_S, PAPER_PUMP, Actuators, Pump, Regulator
 from mjx_softarm.sensing.load import QUANTILE
@@ -148,7 +141,7 @@ def fit_actuators(
     kinds = {"regulator": (regulator, lag_s), "pump": _fit_pump(runs, ~held_out, spec, arm)}
     kinds["specification"] = spec.actuators, arm.of_modes(np.zeros(2 + n_sections), c)
     errors = {
-        name: runs.errors(runs.simulated([actuators.per_chamber(c)]), own_s)[0]
+        name: runs.errors(runs.simulated(actuators.per_chamber(c)), own_s)[0]
         for name, (actuators, own_s) in kinds.items()
     }
     errors["command"] = runs.errors([track.commanded_kpa[:, None] for track in tracks], np.zeros(c))[0]
@@ -161,6 +154,8 @@ def fit_actuators(
     # Put the better kind into the specification
     of_chambers = np.einsum("smr,mc->csr", errors[chosen][held_out].reshape(-1, c, runs.rows), runs.modes)
     arm_lag_s = float(np.mean(kinds[chosen][1])) if by_springs else None
+    # Noise from row to row, by second differences
+    change_kpa = np.concatenate([np.diff(track.pressure_kpa, 2, axis=0) for track in tracks])
     done = ActuatorFit(
         spec=with_actuators(spec, kinds[chosen][0]),
         chosen=chosen,
@@ -168,7 +163,7 @@ def fit_actuators(
         in_sample_rms_kpa=rms_of(errors[chosen][~held_out]),
         held_out_rms_kpa=rms,
         chamber_rms_kpa=np.array([rms_of(error) for error in of_chambers]),
-        noise_kpa=runs.noise_kpa(),
+        noise_kpa=float(SIGMA_PER_MEDIAN * np.median(np.abs(change_kpa)) / 6**0.5),
         n_tracks=len(tracks),
         time_s=sum(len(track.pressure_kpa) for track in tracks) / spec.control.rate_hz,
         arm_lag_s=arm_lag_s,
@@ -183,7 +178,8 @@ def with_actuators(spec: ArmSpec, actuators: Actuators) -> ArmSpec:
     swings. On four rods the springs are then within 0.1 mm after 8 s; with the paper's gains one of the rods
     keeps swinging by 11 mm.
     """
-    values = _plain(actuators)
+    each = dataclasses.asdict(actuators).items()
+    values = {name: tuple(map(float, x)) if np.ndim(x) else float(x) for name, x in each}
     spec = spec.replace(actuators={"kind": actuators.kind, **values})
     if not isinstance(actuators, Regulator) or spec.control.kp_kpa_per_m == 0.0:
         return spec
@@ -204,42 +200,45 @@ def fit_regulator(
     start = _start(runs, used, arm, n_sections)
     parts = np.cumsum([n_shared, c, len(_OWN) * c])
 
-    def numbers(x: np.ndarray) -> tuple[Regulator, np.ndarray]:
-        shared, offset, own, lags = np.split(x, parts)
-        own = np.concatenate([own.reshape(-1, c), np.zeros((len(_SHARED) - len(_OWN), c))])
-        values = {name: getattr(start, name) * np.exp(shared[k] + own[k]) for k, name in enumerate(_SHARED)}
+    def regulators(x: np.ndarray) -> Regulator:
+        shared, offset, own, _ = np.split(x, parts, axis=-1)  # x (p,) or (b, p)
+        logs = shared[..., : len(_SHARED), None] + np.zeros(c)
+        logs[..., : len(_OWN), :] += own.reshape(*x.shape[:-1], len(_OWN), c)
+        values = {name: getattr(start, name) * np.exp(logs[..., k, :]) for k, name in enumerate(_SHARED)}
         values["dead_time_s"] = np.minimum(values["dead_time_s"], LONGEST_DELAY_S)
         # On the way to the best share, one a little beyond the bounds keeps a slope
-        regulator = Regulator(**values, offset_kpa=offset, volume_share=start.volume_share + shared[-1])
-        return regulator, arm.of_modes(lags, c)
+        return Regulator(**values, offset_kpa=offset, volume_share=start.volume_share + shared[..., -1:])
+
+    def lags_s(x: np.ndarray) -> np.ndarray:
+        return arm.of_modes(x[-n_lags:], c)
+
+    # Steps of x: none, each shared number, and the offsets of all chambers
+    steps = np.zeros((n_shared + 2, parts[-1] + n_lags))
+    steps[1:-1, :n_shared] = DIFFERENCE * np.eye(n_shared)
+    steps[-1, n_shared : n_shared + c] = DIFFERENCE
 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # Changes of the pressures by shared numbers, and by the offset, of all chambers
-        rest = np.zeros(len(_OWN) * c + n_lags)
-        steps = DIFFERENCE * np.eye(n_shared + 1)
-        ahead = [x + np.r_[step[:-1], np.full(c, step[-1]), rest] for step in steps]
-        lag_s = numbers(x)[1]
-        kpa = runs.simulated([numbers(tried)[0] for tried in (x, *ahead)])
-        change = [(run[:, 1:] - run[:, :1]) / DIFFERENCE for run in kpa]  # (n, shared + 1, c)
-        # A number of a chamber changes that chamber's pressure alone
-        own = [np.concatenate([one[:, -1:], one[:, : len(_OWN)]], axis=1) for one in change]
-        own = [(one[:, :, None] * np.eye(c)).reshape(len(one), -1, c) for one in own]
-        moved = [np.concatenate([a[:, :-1], b], axis=1) for a, b in zip(change, own, strict=True)]
-        columns = [*runs.clusters(runs.followed(moved, lag_s))]
+        kpa = runs.simulated(regulators(x + steps))
+        columns = []
+        for run in kpa:
+            change = (run[:, 1:] - run[:, :1]) / DIFFERENCE  # (n, shared + 1, c)
+            # The offset and an own number of a chamber change that chamber's pressure alone
+            own = change[:, [-1, *range(len(_OWN))], :, None] * np.eye(c)
+            columns.append(np.concatenate([change[:, :-1], own.reshape(len(run), -1, c)], axis=1))
+        slopes = [*runs.clusters(runs.followed(columns, lags_s(x)))]
         # Changes by the arm's lags
         here_kpa = [run[:, :1] for run in kpa]
-        here = runs.errors(here_kpa, lag_s)[0]
-        for step in DIFFERENCE * np.eye(n_lags):
-            later_s = numbers(x + np.r_[np.zeros(len(x) - n_lags), step])[1]
-            columns.append((runs.errors(here_kpa, later_s)[0] - here) / DIFFERENCE)
-        return here[used], np.stack(columns, axis=-1)[used]
+        here = runs.errors(here_kpa, lags_s(x))[0]
+        lag_steps = DIFFERENCE * np.eye(len(x))[-n_lags:]
+        slopes += [(runs.errors(here_kpa, lags_s(x + step))[0] - here) / DIFFERENCE for step in lag_steps]
+        return here[used], np.stack(slopes, axis=-1)[used]
 
     priors = [SHARED_PRIOR] * len(_SHARED) + [VOLUME_PRIOR] + [OFFSET_PRIOR_KPA] * c
     priors += [CHAMBER_PRIOR] * len(_OWN) * c + [arm.log_std] + [MODE_PRIOR] * (n_lags - 1)
     solution = _fit(model, np.array(priors), runs, used)
-    regulator, lag_s = numbers(solution.x)
-    share = float(np.clip(regulator.volume_share, 0.0, 1.0))
-    return dataclasses.replace(regulator, volume_share=share), lag_s, solution
+    regulator = regulators(solution.x)
+    share = float(np.clip(regulator.volume_share, 0.0, 1.0).item())
+    return dataclasses.replace(regulator, volume_share=share), lags_s(solution.x), solution
 
 
 def _fit_pump(runs: Runs, used: np.ndarray, spec: ArmSpec, arm: ArmLag) -> tuple[Pump, np.ndarray]:
@@ -253,7 +252,7 @@ def _fit_pump(runs: Runs, used: np.ndarray, spec: ArmSpec, arm: ArmLag) -> tuple
 
     def errors(x: np.ndarray) -> np.ndarray:
         pump, lag_s = numbers(x)
-        return runs.errors(runs.simulated([pump]), lag_s)[0][used]
+        return runs.errors(runs.simulated(pump), lag_s)[0][used]
 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         here = errors(x)
@@ -289,33 +288,19 @@ def _fit(model: Model, prior: np.ndarray, runs: Runs, used: np.ndarray) -> Solut
 
 
 def _start(runs: Runs, used: np.ndarray, arm: ArmLag, n_sections: int) -> Regulator:
-    """Return regulators with numbers (c,), alike for all chambers: the best of a grid.
+    """Return a regulator for all chambers: the best of a grid.
 
     Of rates that fit alike the greatest are taken: commands that changed slowly do not show a limit.
     """
-    range_kpa = max(np.ptp(track.commanded_kpa) for track in runs.tracks)
-    c, offset = runs.n_chambers, runs.rest_offset_kpa()
-    grid = [
-        {"lag_s": lag, "dead_time_s": dead, "fill_kpa_per_s": fill, "vent_kpa_per_s": vent}
-        for lag, dead in itertools.product(LAGS_S, DEAD_TIMES_S)
-        for fill, vent in itertools.product(range_kpa * np.array(RATES), repeat=2)
-    ]
-    grid = [{**numbers, "deadband_kpa": DEADBAND_KPA} for numbers in grid]
-    each = [{name: np.full(c, value) for name, value in numbers.items()} for numbers in grid]
-    starts = [
-        Regulator(**numbers, offset_kpa=offset, volume_share=share)
-        for share in VOLUME_SHARES
-        for numbers in each
-    ]
-    errors = runs.errors(runs.simulated(starts), arm.of_modes(np.zeros(2 + n_sections), c))
+    rates = max(np.ptp(track.commanded_kpa) for track in runs.tracks) * np.array(RATES)
+    grid = np.array([*itertools.product(VOLUME_SHARES, LAGS_S, DEAD_TIMES_S, rates, rates)])
+    share, lag_s, dead_time_s, fill, vent = grid.T[..., None]  # (b, 1) each
+    offset_kpa = np.median(np.concatenate([t.pressure_kpa - t.commanded_kpa for t in runs.tracks]), axis=0)
+    starts = Regulator(lag_s, dead_time_s, fill, vent, DEADBAND_KPA, offset_kpa, share)
+    errors = runs.errors(runs.simulated(starts), arm.of_modes(np.zeros(2 + n_sections), runs.n_chambers))
     rms = np.array([rms_of(error[used]) for error in errors])
-    return starts[int(np.argmax(rms <= ALIKE * rms.min()))]
-
-
-def _plain(actuators: Actuators) -> dict[str, float | tuple[float, ...]]:
-    """Return the numbers of actuators as a specification has them."""
-    values = dataclasses.asdict(actuators)
-    return {name: tuple(map(float, x)) if np.ndim(x) else float(x) for name, x in values.items()}
+    share, lag_s, dead_time_s, fill, vent = grid[np.argmax(rms <= ALIKE * rms.min())].tolist()
+    return Regulator(lag_s, dead_time_s, fill, vent, DEADBAND_KPA, volume_share=share)
 
 
 def _half_widths(regulator: Regulator, solution: Solution, arm_lag_s: float | None) -> dict[str, np.ndarray]:

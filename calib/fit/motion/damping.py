@@ -157,12 +157,10 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
             grid, newest, time_s = times_s[-left:], newest[-left:], log.time_s[rows]
             if left == 0 or len(grid) < shortest:
                 continue
-            pressure = log.pressure_kpa[rows[newest]]
+            pressure = log.pressure_kpa[newest]
             if has_commands_alone(log):
-                next_row = rows[
-                    np.minimum(newest + 1, len(rows) - 1)
-                ]  # has the command that was in force before it
-                length_m = None if spring_m is None else spring_m[rows[newest]]
+                next_row = np.minimum(newest + 1, rows[-1])  # has the command that was in force before it
+                length_m = None if spring_m is None else spring_m[newest]
                 pressure = driven_kpa(log.pressure_kpa[next_row], length_m, spec)
             if (np.ptp(pressure[_rows(SETTLING_S, spec) :], axis=0) <= HOLD_KPA).all():
                 continue

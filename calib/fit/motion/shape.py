@@ -135,7 +135,7 @@ def _parts(log: Log, arm: CalibratedArm, left: int) -> list[Part]:
     parts, known = [], np.asarray(np.isfinite(spring_m).all(axis=1))
     stepped = _after_steps(log)
     for part, _, newest in dense_parts(log, EVERY_S, known[1:] != known[:-1]):
-        rows = part[newest][-left:]
+        rows = newest[-left:]
         if left <= 0:
             break
         seen = np.asarray(np.isfinite(tip_m[rows]).all(axis=1)) & ~stepped[rows]

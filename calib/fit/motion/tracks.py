@@ -12,7 +12,6 @@ The mean stretches the section. The differences bend it, against the weight belo
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -20,7 +19,6 @@ import numpy as np
 from scipy.linalg import helmert
 from scipy.signal import lfilter
 
-from calib.fit.leastsquares import SIGMA_PER_MEDIAN
 from mjx_softarm import pneumatics
 from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.logs.rest import HOLD_KPA
@@ -45,15 +43,14 @@ def dense_parts(
         ends (n - 1,) bool: rows after which a part ends, too.
 
     Yields:
-        Rows (m,) of a part; regular times (k,) [s] within it; the newest row (k,) at each of them, as an
-        index within the part.
+        Rows (m,) of a part; regular times (k,) [s] within it; the newest row (k,) of the log at each of them.
     """
     last = np.diff(log.time_s) > MAX_STEP_S
     last = last if ends is None else last | ends
     for rows in np.split(np.arange(len(log)), np.flatnonzero(last) + 1):
         time_s = log.time_s[rows]
         grid = np.arange(time_s[0], time_s[-1], every_s)
-        yield rows, grid, np.searchsorted(time_s, grid + 1e-6, side="right") - 1
+        yield rows, grid, rows[np.searchsorted(time_s, grid + 1e-6, side="right") - 1]
 
 
 def has_commands_alone(log: Log) -> bool:
@@ -67,18 +64,17 @@ def has_commands_alone(log: Log) -> bool:
 
 
 def driven_kpa(commanded_kpa: np.ndarray, spring_m: np.ndarray | None, spec: ArmSpec) -> np.ndarray:
-    """Return the pressures (n, c) [kPa] that an arm's actuators make of commands.
+    """Return the pressures (n, c) [kPa] that an arm's actuators make of commands (n, c) of control periods.
 
-    Args:
-        commanded_kpa (n, c) [kPa]: commands of each control period.
-        spring_m (n, n_springs) [m]: spring lengths, for the volumes; None where they are not known.
-        spec: arm with the actuators.
+    Spring lengths (n, n_springs) [m] give the volumes; None where they are not known.
     """
     actuators = spec.actuators.per_chamber(spec.n_chambers)
-    rest_kpa = commanded_kpa + actuators.rest_offset_kpa
-    track = Track(commanded_kpa, rest_kpa, volumes_m3(spring_m, len(commanded_kpa), spec))
-    runs = Runs([track], 1.0 / spec.control.rate_hz)
-    return runs.simulated([actuators])[0][:, 0]
+    track = Track(
+        commanded_kpa,
+        commanded_kpa + actuators.rest_offset_kpa,
+        volumes_m3(spring_m, len(commanded_kpa), spec),
+    )
+    return Runs([track], 1.0 / spec.control.rate_hz).simulated(actuators)[0][:, 0]
 
 
 def clusters(errors: np.ndarray, size: int) -> np.ndarray:
@@ -125,7 +121,7 @@ def find_tracks(
             if len(grid) < MIN_TRACK_S * spec.control.rate_hz or not changes:
                 continue
             # A row has the command that was in force before it
-            next_row = rows[np.minimum(newest[:left] + 1, len(rows) - 1)]
+            next_row = np.minimum(newest[:left] + 1, rows[-1])
             on_grid, volume = (
                 np.stack([_interpolated(grid, time_s, column) for column in values[rows].T], axis=1)
                 for values in (followed, volume_m3)
@@ -181,61 +177,39 @@ class Runs:
                 run[..., k], _ = lfilter([0.0, 1.0 - kept], [1.0, -kept], run[..., k], axis=0, zi=start)
         return runs
 
-    def simulated(self, actuators: Sequence[Actuators]) -> list[np.ndarray]:
-        """Return the pressures (n, b, c) [kPa] of each track with b actuators of one kind."""
-        delay_s = np.array([np.full(self.n_chambers, one.delay_s) for one in actuators])  # (b, c)
-        offset_kpa = np.array([np.full(self.n_chambers, one.rest_offset_kpa) for one in actuators])
-        together = _stacked(actuators)
-        return [self._run(track, together, delay_s, offset_kpa) for track in self.tracks]
+    def simulated(self, actuators: Actuators) -> list[np.ndarray]:
+        """Return the pressures (n, b, c) [kPa] of each track, at rest before it.
+
+        Args:
+            actuators: b actuators with numbers (b, c) or (b, 1), or one with numbers (c,) or ().
+        """
+        shape = np.broadcast_shapes((1, self.n_chambers), *map(np.shape, vars(actuators).values()))
+        delay = np.broadcast_to(actuators.delay_s, shape) / self._period_s
+        runs = []
+        for track in self.tracks:
+            first_kpa = np.broadcast_to(track.pressure_kpa[0], shape)
+            command_kpa = _delayed(track.commanded_kpa, first_kpa - actuators.rest_offset_kpa, delay)
+            pressure_kpa = np.empty_like(command_kpa)
+            felt_m3 = actuators.felt(track.volume_m3[:, None])  # (n, b or 1, c)
+            gas_m3 = pneumatics.gas_at(first_kpa, felt_m3[0])
+            for k, volume_m3 in enumerate(felt_m3):
+                pressure_kpa[k] = pneumatics.pressure_of(gas_m3, volume_m3)
+                gas_m3 = actuators.fill(gas_m3, volume_m3, command_kpa[k], self._period_s)
+            runs.append(pressure_kpa)
+        return runs
 
     def clusters(self, errors: Sequence[np.ndarray]) -> np.ndarray:
         """Cut errors (n, b, modes) of the tracks into clusters (b, clusters, rows)."""
-        seconds = np.concatenate(
-            [clusters(error.reshape(len(error), -1), self.rows) for error in errors]
-        )  # (s, rows, b modes)
+        each = [clusters(error.reshape(len(error), -1), self.rows) for error in errors]
+        seconds = np.concatenate(each)  # (s, rows, b modes)
         seconds = seconds.reshape(*seconds.shape[:2], -1, self.n_chambers)
         return np.transpose(seconds, (2, 0, 3, 1)).reshape(seconds.shape[2], -1, self.rows)
 
-    def rest_offset_kpa(self) -> np.ndarray:
-        """Return the median of measured less commanded pressures (c,)."""
-        return np.median(np.concatenate([t.pressure_kpa - t.commanded_kpa for t in self.tracks]), axis=0)
-
-    def noise_kpa(self) -> float:
-        """Return the robust standard deviation of the pressures' noise, from second differences of rows."""
-        change = np.concatenate([np.diff(track.pressure_kpa, 2, axis=0) for track in self.tracks])
-        return float(SIGMA_PER_MEDIAN * np.median(np.abs(change)) / 6**0.5)
-
-    def _run(
-        self, track: Track, actuators: Actuators, delay_s: np.ndarray, offset_kpa: np.ndarray
-    ) -> np.ndarray:
-        """Return the pressures (n, b, c) of a track, at rest before it."""
-        first_kpa = np.broadcast_to(track.pressure_kpa[0], delay_s.shape)
-        command_kpa = _delayed(track.commanded_kpa, first_kpa - offset_kpa, delay_s / self._period_s)
-        pressure_kpa = np.empty_like(command_kpa)
-        felt_m3 = actuators.felt(track.volume_m3[:, None])  # (n, b or 1, c)
-        gas_m3 = pneumatics.gas_at(first_kpa, felt_m3[0])
-        for k, volume_m3 in enumerate(felt_m3):
-            pressure_kpa[k] = pneumatics.pressure_of(gas_m3, volume_m3)
-            gas_m3 = actuators.fill(gas_m3, volume_m3, command_kpa[k], self._period_s)
-        return pressure_kpa
-
-
-def _stacked(actuators: Sequence[Actuators]) -> Actuators:
-    """Return actuators of one kind as one, with arrays (b, c) of numbers of chambers, (b, 1) of others."""
-    values: dict[str, Any] = {}
-    for item in dataclasses.fields(actuators[0]):
-        each = np.array([getattr(one, item.name) for one in actuators])
-        values[item.name] = each if each.ndim == 2 else each[:, None] if np.ptp(each) else float(each[0])
-    return dataclasses.replace(actuators[0], **values)
-
 
 def _delayed(command_kpa: np.ndarray, before_kpa: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """Return the mean commands (n, b, c) in each period after dead times.
+    """Return the mean of commands (n, c) in each period (n, b, c) after dead times (b, c) [periods].
 
-    Args:
-        command_kpa (n, c): command of each period.
-        before_kpa (b, c): command before the first.
-        delay (b, c): dead times, in periods.
+    Commands before the first are `before_kpa` (b, c).
     """
     out = np.empty((len(command_kpa), *delay.shape))
     whole, part = np.divmod(delay, 1.0)

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.accuracy.calibration import TRUNK_LOG, read_trunk, trunk_errors
 from calib.fit.blocks import held_out_blocks
 from calib.fit.pose_errors import pose_errors
-from calib.fit.s2r import OF_ROWS, NetworkConfig, fit_network, fit_printed, fit_s2r, moved, simulate_poses
+from calib.fit.s2r import NetworkConfig, fit_network, fit_printed, fit_s2r, moved, simulate_poses
 from calib.report import sections
 from mjx_softarm._support.training import Schedule
 from mjx_softarm.mechanics.params import ArmParams
@@ -67,9 +67,14 @@ def few_points():
 @pytest.fixture(scope="module")
 def fit(spec, arms):
     real = measured(arms[1][:N_ROWS], np.random.default_rng(2))
-    return fit_s2r(
-        spec, first(arms, N_ROWS), real, config=NetworkConfig((64, 64), Schedule(3_000, 4e-3, 512))
-    )
+    return fit_with(NetworkConfig((64, 64), Schedule(3_000, 4e-3, 512)), spec, first(arms, N_ROWS), real)
+
+
+def fit_with(config, *arguments, **options):
+    """Fit with another network than the command's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("calib.fit.s2r.OF_PROCESS", config)
+        return fit_s2r(*arguments, **options)
 
 
 def first(arms, n):
@@ -98,7 +103,7 @@ def test_reported_error_is_that_of_the_held_out_rows(arms, fit):
 def test_the_paper_s_network_gives_the_pose_itself_and_is_judged_by_the_same_rows(spec, arms, fit):
     """It learns all of the pose from few rows; the process knows the simulation, and learns its error."""
     real = measured(arms[1][:N_ROWS], np.random.default_rng(2))
-    printed = fit_s2r(spec, first(arms, N_ROWS), real, config=BRIEF, printed=True)
+    printed = fit_with(BRIEF, spec, first(arms, N_ROWS), real, printed=True)
     np.testing.assert_array_equal(printed.held_out, fit.held_out)
     assert printed.test_uncorrected == fit.test_uncorrected
     assert fit.test_model.translation_mean_mm < printed.test_model.translation_mean_mm < 20.0
@@ -135,30 +140,30 @@ def test_states_far_from_the_log_are_flagged_and_stay_bounded(spec, arms, fit):
 
 def test_held_out_rows_take_no_part_and_the_seed_decides(spec, arms):
     simulated, true = first(arms, 300), arms[1][:300]
-    once = fit_s2r(spec, simulated, true, seed=7, config=BRIEF)
+    once = fit_with(BRIEF, spec, simulated, true, seed=7)
     shifted, stretched = true + 0.0, simulated.spring_m + 0.0
     shifted[once.held_out, :3] += 50.0
     stretched[once.held_out] *= 3.0
-    again = fit_s2r(spec, simulated._replace(spring_m=stretched), shifted, seed=7, config=BRIEF)
+    again = fit_with(BRIEF, spec, simulated._replace(spring_m=stretched), shifted, seed=7)
     assert again.s2r.error_mm > 10.0 > once.s2r.error_mm  # they judge it, and nothing else
     judged_alike = again.s2r._replace(error_mm=once.s2r.error_mm)
     jax.tree.map(np.testing.assert_array_equal, judged_alike, once.s2r)
-    other = fit_s2r(spec, simulated, true, seed=8, config=BRIEF)
+    other = fit_with(BRIEF, spec, simulated, true, seed=8)
     assert not np.array_equal(other.s2r.layers[0][0], once.s2r.layers[0][0])
 
 
 def test_warns_of_few_rows_no_gain_and_another_frame(spec, arms):
     simulated, true = first(arms, 50), arms[1][:50]
-    perfect = fit_s2r(spec, simulated, simulated.pose, config=BRIEF).warnings
+    perfect = fit_with(BRIEF, spec, simulated, simulated.pose).warnings
     assert "got 50 rows" in perfect[0] and "no better than 0 without" in perfect[1]
     turned = moved(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (50, 6)))
-    assert "in 50 of 50 rows" in fit_s2r(spec, simulated, turned, config=BRIEF).warnings[1]
+    assert "in 50 of 50 rows" in fit_with(BRIEF, spec, simulated, turned).warnings[1]
 
 
 def test_a_constant_input_and_a_constant_output_do_no_harm():
     x = np.stack([np.linspace(0.0, 1.0, 300), np.full(300, 0.2)], axis=1)
     y = np.stack([x[:, 0] ** 2, np.full(300, 4.0)], axis=1)
-    fitted = correction(fit_network(x, y, 0, OF_ROWS).network, x)
+    fitted = correction(fit_network(x, y, 0)[0], x)
     np.testing.assert_allclose(fitted[:, 1], 4.0, rtol=1e-6)
     assert np.sqrt(np.mean((fitted - y) ** 2)) < 0.02
 

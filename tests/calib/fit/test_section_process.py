@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.fit import section_process
-from calib.fit.section_process import NOISES, Sections, fit_process, predict, sections
+from calib.fit.section_process import LENGTHS, NOISES, Sections, fit_process, sections
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
@@ -52,7 +52,7 @@ def planted(at):
 def test_sections_are_learned_from_few_tips():
     """The states have 18 numbers, so 300 rows are thin; each section's nine are filled better."""
     rows, unseen = drawn(300, 0), drawn(100, 1)
-    found = predict(fit_process(rows, planted(rows)), unseen)
+    found = fit_process(rows, planted(rows))(unseen)
     spread = np.std(planted(unseen), axis=0)
     assert np.all(np.std(found - planted(unseen), axis=0) < 0.2 * spread)
 
@@ -60,30 +60,31 @@ def test_sections_are_learned_from_few_tips():
 def test_noise_is_told_from_the_correction():
     rows = drawn(300, 0)
     noise = np.random.default_rng(2).normal(size=(300, 6)) * [1.0, 1.0, 1.0, 0.01, 0.01, 0.01]
-    found = predict(fit_process(rows, planted(rows) + noise), rows)
+    found = fit_process(rows, planted(rows) + noise)(rows)
     assert np.all(np.std(found - planted(rows), axis=0) < 0.9 * np.std(noise, axis=0))
 
 
 def test_the_mean_is_the_textbook_s():
     rows, unseen = drawn(20, 0), drawn(5, 1)
     y, levels = planted(rows), np.array([1.0, 1.0, 1.0, LEVER_MM, LEVER_MM, LEVER_MM])
-    process = fit_process(rows, y)
+    predicted = fit_process(rows, y)(unseen)
 
-    def covariance(a, b):
+    def covariance(a, b, length):
         blocks = np.zeros((len(a.state), 6, len(b.state), 6))
         for i, j in np.ndindex(len(a.state), len(b.state)):
             for s in range(2):
                 square = np.sum((a.state[i, s] - b.state[j, s]) ** 2)
-                likeness = 1.0 + np.exp(-square / (2.0 * process.length**2))
+                likeness = 1.0 + np.exp(-square / (2.0 * length**2))
                 blocks[i, :, j] += likeness * a.effect[i, s] @ b.effect[j, s].T
         return blocks.reshape(6 * len(a.state), -1)
 
     means = [
-        covariance(unseen, rows)
-        @ np.linalg.solve(covariance(rows, rows) + s * np.eye(120), (y * levels).ravel())
+        covariance(unseen, rows, length)
+        @ np.linalg.solve(covariance(rows, rows, length) + s * np.eye(120), (y * levels).ravel())
+        for length in LENGTHS
         for s in NOISES
     ]
-    off = [np.abs(mean.reshape(-1, 6) / levels - predict(process, unseen)).max() for mean in means]
+    off = [np.abs(mean.reshape(-1, 6) / levels - predicted).max() for mean in means]
     assert min(off) < 1e-6
 
 
