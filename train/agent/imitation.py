@@ -87,7 +87,7 @@ STAGES_OPTION = PrimitiveConstructorSpec(
 
 @dataclass(frozen=True)
 class ImitationConfig(TQCConfig):
-    """Settings of learning from demonstrations, whose poses are the goals. Raises InputError."""
+    """Settings of learning from demonstrations, whose poses are the goals."""
 
     FROM_DEMONSTRATIONS: ClassVar[bool] = True
 
@@ -135,11 +135,7 @@ class ImitationConfig(TQCConfig):
         check_settings("env", env, required)
 
     def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> ReplayEpoch:
-        """Return the epoch of the learner, with demonstrated starts and goals.
-
-        Raises:
-            InputError: demonstrations are missing.
-        """
+        """Return the epoch of the learner, with demonstrated starts and goals."""
         if shown is None:
             raise InputError("learner: got 'imitation' without demonstrations, expected a file of them")
         return ReplayEpoch(self, env, Imitation(self, env, shown), DemonstratedGoals(self, env, shown))

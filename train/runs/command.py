@@ -26,7 +26,7 @@ from train.options import ArmOptions, start
 from train.presets import IMITATION_PRESETS, PRESETS, preset_of
 from train.runs import run as runs
 from train.runs.evaluate import N_ACTIONS
-from train.runs.folder import Run, sole_trainer
+from train.runs.folder import Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,8 +243,7 @@ def _resume(options: Reach | Imitate, path: Path, console: Console) -> int:
 def _train(run: Run, task: runs.Task, console: Console) -> int:
     console.print(f"run: {run.path}", soft_wrap=True)
     try:
-        with sole_trainer(run.path):
-            summary = runs.train(run, task, console)
+        summary = runs.train(run, task, console)
     except runs.Interrupted as stop:
         console.print(str(stop))
         return cli.INTERRUPTED

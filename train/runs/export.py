@@ -30,7 +30,6 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support import cli
@@ -101,8 +100,7 @@ def export(
     if not weights:
         n_enough = sum(_export(path, out, onnx, cpp, calibration, console) for path in folders)
         return 0 if n_enough == len(folders) else 1
-    folder = next(iter(folders))
-    entries = actor_entries(Run.open(folder))
+    entries = actor_entries(Run.open(next(iter(folders))))
     write_sealed(weights, entries, WEIGHTS)
     layers = [entries[f"actor.{k}.weight"] for k in range(int(entries["actor.n_layers"]))]
     console.print(f"weights: {weights}, {_size(weights)}: actor {_widths(layers)}")
@@ -115,7 +113,7 @@ def _export(
     """Write the policy of a run; return whether it needs no training on a later calibration."""
     from mjx_softarm.export.write import export_cpp, export_onnx
     from train.options import ArmOptions, start
-    from train.runs.arm_model import N_STEPS, arm_model
+    from train.runs.arm_model import arm_model
 
     start()
     run, file, keeps, enough = Run.open(path), out, path, True
@@ -125,19 +123,9 @@ def _export(
         later = renewed(run, ArmOptions(calibration=calibration).read_arm(console))
         enough = policy_still_accurate(run, later, calibration, console)
         run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
-    # Distil the arm's networks, unless they are kept
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("reading the arm's networks", total=N_STEPS)
-
-        def say(step: str) -> None:
-            progress.update(bar, description=step, advance=1)
-            if not console.is_terminal:
-                console.print(f"{step} ...")
-
-        arm = arm_model(run.arm, keeps, say)
+    # Distil the arm's networks, unless they are kept; write the policy and say what it holds
+    arm = arm_model(run.arm, keeps, lambda step: console.print(f"{step} ..."))
     policy = export_run(run, arm, file)
-    # Say what was written
     console.print(f"policy: {policy}, {_size(policy)}")
     for line in contents(load_policy(policy)):
         console.print(f"  {line}")
@@ -147,12 +135,9 @@ def _export(
 
 
 def renewed(run: Run, arm: CalibratedArm) -> Run:
-    """Return a run with another calibration of its arm.
+    """Return a run with another calibration of its arm; raise InputError if it is another arm.
 
     Its actions stay readings of the same spring lengths: the range of lengths remains that of the training.
-
-    Raises:
-        InputError: it is another arm.
     """
     counts = [(spec.structure.n_sections, spec.n_chambers, spec.n_springs) for spec in (run.spec, arm.spec)]
     if counts[0] != counts[1]:

@@ -72,29 +72,27 @@ class Checkpoints:
         self._manager.save(epoch, args=ocp.args.Composite(**saved))
         self._manager.wait_until_finished()
 
-    def restore(self, like: Any) -> tuple[int, Any]:
-        """Return the newest checkpoint: epochs done, and state, structured as the state or shapes `like`.
+    def restore(self, like: Any, epoch: int | None = None) -> Any:
+        """Return the state after an epoch, by default the newest, structured as the state or shapes `like`.
 
-        Raises:
-            InputError: there is no checkpoint, or it cannot be read.
+        Raises InputError if there is no checkpoint, or it cannot be read.
         """
-        return self._newest("state", ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like)))
+        shapes = jax.tree.map(_shape_somewhere, like)
+        return self._read("state", ocp.args.StandardRestore(shapes), epoch)
 
     def parts(self) -> dict[str, Any]:
         """Return the newest checkpoint's parts of the learner as NumPy arrays; see `Learner.parts`.
 
-        Raises:
-            InputError: there is no checkpoint, or it cannot be read.
+        Raises InputError as `restore` does.
         """
-        return self._newest("parts", ocp.args.StandardRestore())[1]
+        return self._read("parts", ocp.args.StandardRestore())
 
-    def _newest(self, item: str, how: ocp.args.CheckpointArgs) -> tuple[int, Any]:
-        """Return the number of epochs behind the newest checkpoint, and an item of it."""
-        epoch = self.latest
+    def _read(self, item: str, how: ocp.args.CheckpointArgs, epoch: int | None = None) -> Any:
+        epoch = self.latest if epoch is None else epoch
         if epoch is None:
             raise InputError(f"{self.run}: got no checkpoint, expected one; start the run anew")
         try:
-            return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
+            return self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
         except Exception as error:
             folder = self.path / str(epoch)
             if _is_damage(folder / item, error):
