@@ -71,8 +71,8 @@ class Sweep(ReachOptions):
         except Interrupted as stop:
             console.print(str(stop))
             return cli.INTERRUPTED
-        console.print(report(path, runs))
-        console.print(f"results: {path / RESULTS_FILE}", soft_wrap=True)
+        console.print(report(path, runs), soft_wrap=False)
+        console.print(f"results: {path / RESULTS_FILE}")
         return 0
 
 

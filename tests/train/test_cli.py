@@ -230,8 +230,6 @@ def test_imitation_hands_its_reward_and_its_layers_on(arm, demonstrations, tmp_p
     assert len(json.loads((donor / "evaluation.json").read_text())["error_mm"]) == 6
 
     capsys.readouterr()
-    assert main([*imitate, str(heir), "--learner.frozen"]) == 2
-    assert "learner.frozen: got true, expected --reward RUN" in capsys.readouterr().err
     weights = ["--learner.learned-weight=0", "--learner.hand-made-weight=1"]
     assert main([*imitate, str(heir), *weights, "--reward", str(donor)]) == 2
     assert "learner.learned_weight: got 0 with --reward" in capsys.readouterr().err

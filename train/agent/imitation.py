@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from tyro.conf import Suppress
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import xla
@@ -97,8 +98,7 @@ class ImitationConfig(TQCConfig):
     """weight of the learned reward; with 0, only the poses of the demonstrations are used"""
     hand_made_weight: Amount = 0.0
     """weight of the environment's reward"""
-    frozen: bool = False
-    """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
+    frozen: Suppress[bool] = False  # whether the discriminator is that of `--reward`, and stays as it is
     expert_share: PartialShare = 0.25
     """share of the critics' batches that is the expert's"""
     expert_start: ExpertStart = "agent"

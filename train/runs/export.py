@@ -55,6 +55,7 @@ from mjx_softarm.policy.file import (
 )
 from mjx_softarm.sensing.estimator import POSE_ERROR_MM
 from mjx_softarm.spec import ArmSpec
+from train.options import ArmOptions, start
 from train.runs.folder import DEMONSTRATIONS_FILE, Run
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def export(
     others = {"--out": out, "--onnx": onnx, "--cpp": cpp, "--calibration": calibration}
     if weights and (given := [name for name, value in others.items() if value]):
         raise InputError(f"--weights: got {' and '.join(given)} too, expected it alone")
-    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console = start()
     if not weights:
         n_enough = sum(_export(path, out, onnx, cpp, calibration, console) for path in folders)
         return 0 if n_enough == len(folders) else 1
@@ -112,10 +113,8 @@ def _export(
 ) -> bool:
     """Write the policy of a run; return whether it needs no training on a later calibration."""
     from mjx_softarm.export.write import export_cpp, export_onnx
-    from train.options import ArmOptions, start
     from train.runs.arm_model import arm_model
 
-    start()
     run, file, keeps, enough = Run.open(path), out, path, True
     actor_of(run)  # before the networks are distilled, which takes a minute
     # A later calibration takes the place of the run's
@@ -177,7 +176,7 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
     task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if shown else "reach"
     preset = before.origin()["preset"]
     options = f"--agent {before.path} --calibration {calibration}" + (f" --preset {preset}" if preset else "")
-    console.print(f"NOT enough: go on training: python -m train {task} {options}", soft_wrap=True)
+    console.print(f"NOT enough: go on training: python -m train {task} {options}")
     return False
 
 
@@ -200,14 +199,12 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
     Raises:
         InputError: the policy is not one that the file can hold, or the file cannot be written.
     """
-    # Say how the policy came about: the run's config with versions and commit, and the arm's networks.
     provenance = {
         **run.origin(),
         "epoch": run.checkpoints.latest,
         "estimator_errors": arm.errors,
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    # Put all together; this checks the shapes of the parameters.
     env = run.config.env
     try:
         policy = policy_from_actor(
@@ -229,11 +226,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
 
 
 def actor_of(run: Run) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Return weight and bias of each layer of a run's newest actor.
-
-    Raises:
-        InputError: the run has no checkpoint, or its policy is not a network that an export can hold.
-    """
+    """Return weight and bias of each layer of a run's newest actor; raise InputError if it has no such."""
     try:
         return actor_layers(run.policy(), run.spec)
     except (ValueError, AttributeError) as error:
@@ -243,9 +236,7 @@ def actor_of(run: Run) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
 def actor_entries(run: Run) -> dict[str, np.ndarray]:
     """Return the entries of the file with a run's actor alone; the module lists them.
 
-    Raises:
-        InputError: see `actor_of`.
-        SealedFileError: a layer has another size than observation or action, or is not finite.
+    Raises InputError for an actor of other sizes than observation and action, or that is not finite.
     """
     spec, env = run.spec, run.config.env
     layout, actions = layouts(spec)[env.observation], ActionMap.from_spec(spec)

@@ -196,10 +196,8 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
 def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State, dict[str, Any]]:
     """Return the state that a new run begins with, and its parts; some of these are another run's.
 
-    Networks are those of the donor `agent`, the learned reward is that of the donor `reward`.
-
-    Raises:
-        InputError: a donor has no such part, or one of another size.
+    Networks are those of the donor `agent`, the learned reward is that of the donor `reward`. Raises
+    InputError for a donor without such a part, or with one of another size.
     """
     state, learner = task.job.init(jax.random.PRNGKey(seed)), task.job.learner
     for option, donor in donors.items():
