@@ -64,8 +64,7 @@ class TrainConfig:
 def override(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:
     """Return a copy of a config with settings such as `learner.gamma=0.95` changed, all of them at once.
 
-    Raises:
-        InputError: a setting is unknown or of the wrong type, or the config refuses its value.
+    Raises InputError for a setting that is unknown or of the wrong type, or that the config refuses.
     """
     data = to_dict(config)
     for assignment in assignments:
@@ -101,13 +100,8 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 def from_dict(data: dict[str, Any]) -> TrainConfig:
     """Return the config that `to_dict` gave; a setting that is missing has its default.
 
-    The policies of runs that have no `activation` are ReLU networks.
-
-    Raises:
-        InputError: a setting is unknown or of the wrong type.
+    Raises InputError for a setting that is unknown or of the wrong type.
     """
-    if isinstance(learner := data.get("learner"), dict):
-        data = {**data, "learner": {"activation": "relu", **learner}}
     return _read(TrainConfig, data, "config")
 
 

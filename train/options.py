@@ -30,11 +30,11 @@ class ArmOptions:
         arm = CalibratedArm.read(self.calibration)
         if arm.s2r is None:
             absent = self.calibration / S2R_FILE
-            console.print(f"no {absent}: training on simulated poses", soft_wrap=True)
+            console.print(f"no {absent}: training on simulated poses")
         return arm
 
 
 def start() -> Console:
-    """Turn on the cache of compiled programs; returns the console to print to."""
+    """Turn on the cache of compiled programs; return the console to print to, which breaks no line."""
     xla.enable_compilation_cache()
-    return Console(highlight=False, markup=False)
+    return Console(highlight=False, markup=False, soft_wrap=True)

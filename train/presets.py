@@ -132,11 +132,7 @@ GPU_SIZES = {
 
 
 def preset_of(name: str, size: str) -> TrainConfig:
-    """Return a preset for a CPU or a GPU.
-
-    Raises:
-        InputError: the preset has no size for a GPU.
-    """
+    """Return a preset for a CPU or a GPU; raise InputError if it has no size for a GPU."""
     if size == "cpu":
         return PRESETS[name]
     if name not in GPU_SIZES:

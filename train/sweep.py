@@ -34,7 +34,7 @@ from train.epoch.job import Epoch, Job, State
 from train.options import start
 from train.runs.command import ReachOptions
 from train.runs.evaluate import Summary
-from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run, sole_trainer
+from train.runs.folder import CONFIG_FILE, EVALUATION_FILE, Run
 from train.runs.run import FreshPoses, Interrupted, free_path, task_of, train_together
 
 RESULTS_FILE = "results.json"
@@ -67,13 +67,12 @@ class Sweep(ReachOptions):
         console.print(f"sweep: {path}, {len(runs)} members")
         # Train all of them, and report.
         try:
-            with sole_trainer(path):
-                train(path, runs, console)
+            train(path, runs, console)
         except Interrupted as stop:
             console.print(str(stop))
             return cli.INTERRUPTED
-        console.print(report(path, runs))
-        console.print(f"results: {path / RESULTS_FILE}", soft_wrap=True)
+        console.print(report(path, runs), soft_wrap=False)
+        console.print(f"results: {path / RESULTS_FILE}")
         return 0
 
 
@@ -197,18 +196,16 @@ def train(path: Path, runs: Sequence[Run], console: Console) -> None:
     numbers = {name: jnp.asarray(x, jnp.float32) for name, x in differing(runs).items()}
     tasks = {config.env: task_of(config, with_config(env, config)) for config in configs}
 
-    def begin() -> tuple[int, MembersState]:
+    def begin() -> MembersState:
         # Continue from the newest epoch that all members have a checkpoint of.
         epoch = max(set.intersection(*(set(run.checkpoints.epochs) for run in runs)), default=0)
-        for run in runs:
-            run.rewind(epoch)
         console.print("compiling (cached for the next start) ...")
         if not epoch:
-            return 0, job.init((keys, numbers))
+            return job.init((keys, numbers))
         like = jax.eval_shape(lambda state: state.member(0), job.shapes((keys, numbers)))
-        members = [run.checkpoints.restore(like)[1] for run in runs]
+        members = [run.checkpoints.restore(like, epoch) for run in runs]
         states = jax.tree.map(lambda *x: jnp.stack(x), *members)._replace(n_epochs=members[0].n_epochs)
-        return epoch, MembersState(states, numbers)
+        return MembersState(states, numbers)
 
     members = [(run, tasks[run.config.env]) for run in runs]
     train_together(job, members, begin, path, console, MembersState.member)

@@ -70,13 +70,6 @@ def test_json_with_a_setting_too_many_is_refused_and_a_missing_one_has_its_defau
     assert from_dict({"learner": {"name": "tqc"}}) == TrainConfig()
 
 
-def test_runs_without_an_activation_have_relu_networks():
-    data = to_dict(PRESETS["analytic"])
-    assert from_dict(data).learner.activation == "swish"
-    del data["learner"]["activation"]
-    assert from_dict(data).learner.activation == "relu"
-
-
 def test_epochs_cover_the_steps_asked_for_and_updates_count_from_the_end_of_warm_up():
     config = TQCConfig(
         total_env_steps=10_001,

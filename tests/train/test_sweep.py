@@ -1,7 +1,6 @@
 """Sweeps: a member is the ordinary run, all are traced once, and a killed sweep ends with the same bits."""
 
 import dataclasses
-import io
 import json
 from operator import attrgetter
 
@@ -9,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support.errors import InputError
@@ -18,15 +16,12 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from tests.arms import SHORT
 from tests.train import small
 from tests.train.small import new_job
-from train import sweep
 from train.__main__ import main
 from train.config import override
 from train.epoch.job import Job
 from train.presets import PRESETS
-from train.runs import plots
 from train.runs.evaluate import Summary
 from train.runs.folder import Checkpoints, Run
-from train.runs.run import Task
 from train.sweep import RESULTS_FILE, MembersEpoch, members_of, open_members, report, variable
 
 CONFIG = dataclasses.replace(
@@ -103,80 +98,38 @@ def test_a_sweep_is_traced_once_and_warms_up_without_updates(job, trained):
     assert program.count("stablehlo.case") == 1
 
 
-class MadeUp:
-    """Figures that depend on every parameter of an actor."""
-
-    def __init__(self, actor_params):
-        self.size = float(sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(actor_params)))
-
-    def to_dict(self):
-        return dict.fromkeys(AT_REST, self.size)
-
-
-@pytest.fixture
-def ready(env, job, monkeypatch):
-    """Sweeps of the members train with the compiled job, and are evaluated by made-up figures."""
-    evaluate = lambda actor_params: (MadeUp(actor_params),)  # noqa: E731
-    task = Task(job=None, evaluate=evaluate, prepare=lambda state, epoch: state)
-    monkeypatch.setattr(plots, "save", lambda folder, rows, figures: None)
-    monkeypatch.setattr(sweep, "ReachEnv", lambda spec, config, s2r: env)
-    monkeypatch.setattr(sweep, "Job", lambda epoch, pool_of: job)
-    monkeypatch.setattr(sweep, "task_of", lambda config, env: task)
-
-
 def dying(checkpoints, epoch, *rest, save=Checkpoints.save):
-    """Saves until the second member is to be saved after the sixth epoch."""
-    if epoch == 6 and Run.open(checkpoints.run).config.seed == 3:
+    """Save until the first member of seed 5 is to be saved after the sixth epoch."""
+    if epoch == 6 and Run.open(checkpoints.run).config.seed == 5:
         raise KeyboardInterrupt
     save(checkpoints, epoch, *rest)
 
 
-def create(path, members):
-    return [Run.create(path / name, config, CalibratedArm(SHORT)) for name, config in members.items()]
-
-
-def test_a_stopped_sweep_ends_with_the_same_bits(ready, job, given, members, tmp_path, monkeypatch):
-    console = Console(file=io.StringIO())
+def test_a_stopped_sweep_ends_with_the_same_bits(tmp_path, monkeypatch, capsys):
+    SHORT.to_toml(arm := tmp_path / "arm.toml")
+    command = ["sweep", *small.flags(total_env_steps=128), "--evaluation-epochs=2", "--spec", str(arm)]
+    command += ["--seeds=4,5", "--vary=learner.gamma=0.5,0.9"]
     paths = [tmp_path / name for name in ("whole", "stopped")]
-    whole, stopped = (create(path, members) for path in paths)
-    sweep.train(paths[0], whole, console)
+    assert main([*command, "--out", str(paths[0])]) == 0
     with monkeypatch.context() as patch:
         patch.setattr(Checkpoints, "save", dying)
-        with pytest.raises(KeyboardInterrupt):
-            sweep.train(paths[1], stopped, console)
-    resumed = open_members(paths[1])
-    assert [run.config for run in resumed] == list(members.values())
-    assert [run.checkpoints.epochs for run in resumed] == [[4, 6], [2, 4]]
-    sweep.train(paths[1], resumed, console)
-    assert "continuing after epoch 4 of 8" in console.file.getvalue()
+        assert main([*command, "--out", str(paths[1])]) == 130
+    assert [run.checkpoints.epochs for run in open_members(paths[1])] == [[4, 6], [4, 6], [2, 4], [2, 4]]
+    assert main(["sweep", "--resume", str(paths[1])]) == 0
+    assert "continuing after epoch 4 of 8" in capsys.readouterr().out
 
-    like = jax.eval_shape(lambda states: states.member(0), job.shapes(given))
-    for one, other in zip(whole, resumed, strict=True):
-        (epoch, expected), (resumed_epoch, got) = (run.checkpoints.restore(like) for run in (one, other))
-        assert epoch == resumed_epoch == 8
-        jax.tree.map(np.testing.assert_array_equal, jax.device_get(expected), jax.device_get(got))
+    for one, other in zip(*map(open_members, paths), strict=True):
+        assert one.config == other.config and one.evaluation() == other.evaluation()
+        jax.tree.map(np.testing.assert_array_equal, one.checkpoints.parts(), other.checkpoints.parts())
         rows = [
-            [{k: x for k, x in row.items() if "speed" not in k} for row in r.metrics()] for r in (one, other)
+            [{k: x for k, x in row.items() if "speed" not in k} for row in run.metrics()]
+            for run in (one, other)
         ]
         assert rows[0] == rows[1] and [row["epoch"] for row in rows[0]] == list(range(1, 9))
         assert ["evaluation/median_mm" in row for row in rows[0]] == [False, True] * 4
-
-
-@pytest.mark.slow
-def test_a_sweep_as_a_user_runs_it(tmp_path, capsys):
-    SHORT.to_toml(arm := tmp_path / "arm.toml")
-    path = tmp_path / "whole"
-    command = ["sweep", *small.flags(), "--evaluation-epochs=4", "--spec", str(arm), "--seeds", "4,5"]
-    command += ["--vary", "env.reward.goal_bonus=50,90"]
-    assert main([*command, "--out", str(path)]) == 0
-    results = json.loads((path / RESULTS_FILE).read_text())["groups"]
-    assert [len(rows) for rows in results.values()] == [2, 2]
-    member = path / "seed4-env.reward.goal_bonus=90"
-    figures = (member / "evaluation.json").read_text()
-    assert main(["evaluate", str(member)]) == 0
-    assert (member / "evaluation.json").read_text() == figures
-    capsys.readouterr()
-    assert main([*command, "--out", str(path)]) == 2
+    results = [json.loads((path / RESULTS_FILE).read_text())["groups"] for path in paths]
+    assert results[0] == results[1] and [len(rows) for rows in results[0].values()] == [2, 2]
+    assert main([*command, "--out", str(paths[0])]) == 2
     assert "which exists, expected a new folder, or --resume" in capsys.readouterr().err
 
 
@@ -193,7 +146,8 @@ def test_members_are_the_product_of_seeds_and_values():
 
 def test_the_table_has_mean_least_and_greatest_over_the_seeds(tmp_path):
     """Two seeds and two settings with figures made up; a member without figures is named."""
-    create(tmp_path, members_of(CONFIG, (0, 1), ["learner.gamma=0.5,0.9"]))
+    for name, config in members_of(CONFIG, (0, 1), ["learner.gamma=0.5,0.9"]).items():
+        Run.create(tmp_path / name, config, CalibratedArm(SHORT))
     runs = open_members(tmp_path)
     with pytest.raises(InputError, match="got no evaluation.json, expected a finished run"):
         report(tmp_path, runs)

@@ -51,7 +51,7 @@ EARLY = 0.2  # weight of the mean cost of all actions beside that of the last: t
 
 @dataclass(frozen=True)
 class AnalyticConfig(LearnerConfig):
-    """Hyperparameters of learning through the simulation. Raises InputError naming a bad field."""
+    """Hyperparameters of learning through the simulation."""
 
     VARIABLE = ("learning_rate", "learning_rate_half", "mean_share", "saturation_cost_per_mm")
 
@@ -189,23 +189,25 @@ class GradientEpoch:
         # Act H times, and differentiate each arm's loss by each of its actions.
         look_ahead = jax.vmap(jax.value_and_grad(self._loss, has_aux=True), in_axes=(0, 0, None))
         changes = jnp.zeros((self.arms.n, self.config.horizon, self.env.action_size))
-        ahead: _Ahead
-        d_action: Array  # (B, H, A)
-        (loss, ahead), d_action = look_ahead(changes, state.arms, state.learner.actor_params)
+        (loss, ahead), d_action = look_ahead(changes, state.arms, state.learner.actor_params)  # _, (B, H, A)
 
         # Leave out arms that did not settle, and gradients that are not finite, as at a pitch of 90 degrees.
         valid = ahead.valid & jnp.all(jnp.isfinite(d_action), axis=(1, 2))  # (B,)
         d_action = jnp.where(valid[:, None, None], d_action, jnp.zeros_like(d_action)) / self.arms.n
 
-        # Descend, and let the arms go on.
+        # Descend, and let the arms go on; some of them begin anew.
         learner, gradient_norm = self.learner.update(state.learner, ahead.obs, d_action)
+        key_new, key_reset = jax.random.split(key_arms)
+        new = draws.uniform(key_new, (self.arms.n,)) < NEW_SHARE
+        new |= ~ahead.after.info["valid"]
+        arms = choose_arms(new, self.arms.reset(key_reset), ahead.after)
         metrics = {
             "loss": jnp.sum(loss, where=valid) / jnp.maximum(jnp.sum(valid), 1),
             "gradient_norm": gradient_norm,
             "left_out": jnp.mean(~valid),
         }
         env_metrics = {f"env/{name}": jnp.mean(x) for name, x in ahead.after.metrics.items()}
-        state = state._replace(arms=self._go_on(ahead.after, key_arms), learner=learner, key=key)
+        state = state._replace(arms=arms, learner=learner, key=key)
         return state, env_metrics | {f"analytic/{name}": x for name, x in metrics.items()}
 
     def _loss(self, changes: Array, arm: State, params: Params) -> tuple[Array, _Ahead]:
@@ -232,10 +234,3 @@ class GradientEpoch:
             off_m = control.blocked_springs(after.info["blocked"], self.env.gains) * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
         return off + cost + self.env.clearance_cost(after.info["clearance_mm"])
-
-    def _go_on(self, after: State, key: Array) -> State:
-        """Return the arms, some of them with a new start and goal."""
-        key_new, key_reset = jax.random.split(key)
-        new = draws.uniform(key_new, (self.arms.n,)) < NEW_SHARE
-        new |= ~after.info["valid"]
-        return choose_arms(new, self.arms.reset(key_reset), after)

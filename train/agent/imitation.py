@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from tyro.conf import Suppress
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import xla
@@ -87,7 +88,7 @@ STAGES_OPTION = PrimitiveConstructorSpec(
 
 @dataclass(frozen=True)
 class ImitationConfig(TQCConfig):
-    """Settings of learning from demonstrations, whose poses are the goals. Raises InputError."""
+    """Settings of learning from demonstrations, whose poses are the goals."""
 
     FROM_DEMONSTRATIONS: ClassVar[bool] = True
 
@@ -97,8 +98,7 @@ class ImitationConfig(TQCConfig):
     """weight of the learned reward; with 0, only the poses of the demonstrations are used"""
     hand_made_weight: Amount = 0.0
     """weight of the environment's reward"""
-    frozen: bool = False
-    """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
+    frozen: Suppress[bool] = False  # whether the discriminator is that of `--reward`, and stays as it is
     expert_share: PartialShare = 0.25
     """share of the critics' batches that is the expert's"""
     expert_start: ExpertStart = "agent"
@@ -135,11 +135,7 @@ class ImitationConfig(TQCConfig):
         check_settings("env", env, required)
 
     def make_epoch(self, env: ReachEnv, shown: Demonstrations | None = None) -> ReplayEpoch:
-        """Return the epoch of the learner, with demonstrated starts and goals.
-
-        Raises:
-            InputError: demonstrations are missing.
-        """
+        """Return the epoch of the learner, with demonstrated starts and goals."""
         if shown is None:
             raise InputError("learner: got 'imitation' without demonstrations, expected a file of them")
         return ReplayEpoch(self, env, Imitation(self, env, shown), DemonstratedGoals(self, env, shown))

@@ -13,9 +13,10 @@ Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K k
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -25,7 +26,7 @@ from jax import Array
 
 from mjx_softarm._support import draws
 from mjx_softarm._support.errors import check_settings
-from mjx_softarm._support.fields import Amount, Count, Number, Positive, PositiveShare, Share
+from mjx_softarm._support.fields import Amount, Count, Number, Positive, PositiveShare, Rule, Share
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
 from train.agent import networks
@@ -34,6 +35,7 @@ from train.agent.learner import Transition
 from train.epoch.replay_epoch import ReplayConfig
 
 Params = Any  # a flax parameter tree
+Finite = Annotated[float, Rule()]
 ERROR_UNIT = 0.2  # error of 1 in the predictor's units: some 36 mm, what an arm moves in half a second
 PREDICTION_WEIGHT = 10.0  # weight of the prediction's loss beside that of the critics
 COST_AHEAD = 40.0  # initial weight of a predicted error of 1, summed over the predictions
@@ -58,8 +60,13 @@ class TQCConfig(ReplayConfig):
     gamma: Share = 0.99  # discount per step
     tau: PositiveShare = 0.005  # Polyak rate of the target critics and of the mean actor, per update
     initial_alpha: Positive = 1.0  # initial temperature
-    target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
-    reward_scale: float = 1.0  # factor on every reward in the critics' targets
+    target_entropy: Finite | None = None  # target entropy [nat]; None is minus the number of actions
+    reward_scale: Positive = 1.0  # factor on every reward in the critics' targets
+
+    def __init_subclass__(cls) -> None:
+        makes_one = {"make_learner", "make_epoch"} & vars(cls).keys()
+        if inspect.get_annotations(cls) and not makes_one:
+            raise TypeError(f"{cls.__name__}: got settings without `make_learner`, expected who reads them")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -43,8 +43,7 @@ def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
 def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Finding]]:
     """Return the checked rows of a file, and findings on its unknown columns.
 
-    Raises:
-        LogError: the file cannot be used; the message has a line for each finding.
+    Raises LogError for a file that cannot be used; its message has a line for each finding.
     """
     matrix, extra = read_matrix(path, spec, NEEDED)
     refuse(list(_not_finite(matrix)))

@@ -190,11 +190,7 @@ class Expert:
         return xla.in_batches(self._look, _BATCH, pressure_kpa)
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Posture:
-        """Return postures (n,) at waypoints, each near its predecessor.
-
-        Raises:
-            ExpertError: a waypoint cannot be met.
-        """
+        """Return postures (n,) at waypoints, each near its predecessor; see `reach`."""
         postures, before = [], np.zeros(self.spec.n_chambers)
         for waypoint in waypoints:
             postures.append(self.reach(waypoint.name, self.target(waypoint), before))
@@ -209,8 +205,7 @@ class Expert:
     def reach(self, name: str, target: PostureTarget, before_kpa: np.ndarray) -> Posture:
         """Return the posture that meets a target, near the one at `before_kpa` (n_chambers,).
 
-        Raises:
-            ExpertError: there is none; `name` is in its message.
+        Raises ExpertError if there is none; `name` is in its message.
         """
         target = jax.tree.map(np.float32, target._replace(near_kpa=before_kpa))
         starts = np.float32(self._starts(target))

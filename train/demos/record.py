@@ -170,7 +170,7 @@ class Record(ArmOptions):
 
     def __call__(self) -> int:
         console = start()
-        say = partial(console.print, soft_wrap=True)
+        say = console.print
         check_file("--out", self.out)
         if self.out.exists():
             raise InputError(f"--out: got {self.out}, which is there already, expected a new file")
@@ -205,7 +205,7 @@ class Check(ArmOptions):
         spec = self.read_arm(console).spec
         log, findings = read_demonstrations(self.file, spec)
         for text in (*_summary(log, spec), *map(str, findings)):
-            console.print(text, soft_wrap=True)
+            console.print(text)
         return 0
 
 

@@ -6,7 +6,6 @@ on batches that are drawn uniformly from it, with goals exchanged in hindsight.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -17,7 +16,7 @@ from jax import Array
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
 from mjx_softarm._support.errors import check_settings
-from mjx_softarm._support.fields import Count, Number
+from mjx_softarm._support.fields import Count, Number, Positive
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv
@@ -35,7 +34,7 @@ class ReplayConfig(LearnerConfig):
     """Settings of a learner from the replay. Raises InputError."""
 
     episode_length: Count = N_ACTIONS  # actions per episode at most
-    updates_per_env_step: float = 1.0  # gradient steps per action of one arm
+    updates_per_env_step: Positive = 1.0  # gradient steps per action of one arm
     warmup_env_steps: Number = 2_048  # actions drawn uniformly before the first gradient step
     batch_size: Count = 256  # transitions per gradient step
     replay_capacity: int = 400_000  # transitions kept
@@ -44,10 +43,9 @@ class ReplayConfig(LearnerConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        of_arms = f"a finite number of at least one update per step of all {self.n_arms} arms"
-        updates = math.isfinite(self.updates_per_env_step) and self.n_updates_per_vector_step >= 1
+        least = f"at least one update per step of all {self.n_arms} arms, {1 / self.n_arms:.4g}"
         required = {
-            "updates_per_env_step": (updates, f"{of_arms}, {1 / self.n_arms:.4g}"),
+            "updates_per_env_step": (self.n_updates_per_vector_step >= 1, least),
             "replay_capacity": (self.replay_capacity >= self.n_arms, f"at least n_arms = {self.n_arms}"),
         }
         check_settings("learner", self, required)
@@ -125,10 +123,7 @@ class ReplayState(NamedTuple):
 
 
 class ReplayEpoch:
-    """Epoch of a learner from the replay.
-
-    `goals` are `train.agent.imitation.DemonstratedGoals`; None: the environment draws starts and goals.
-    """
+    """Epoch of a learner from the replay; starts and goals are `goals`', or else the environment's."""
 
     def __init__(self, config: ReplayConfig, env: ReachEnv, learner: Learner, goals: Any = None):
         self.config, self.env, self.learner, self.goals = config, env, learner, goals
@@ -149,11 +144,10 @@ class ReplayEpoch:
         return ReplayState(arms, learner, memory, goals, key, n_epochs=jnp.zeros((), jnp.int32))
 
     def advance(self, state: ReplayState) -> tuple[ReplayState, dict[str, Array]]:
-        """Move every arm by `vector_steps_per_epoch` actions, with their updates.
+        """Move every arm by `vector_steps_per_epoch` actions, with their updates; return also the metrics.
 
-        Returns:
-            The next state; means over the epoch by name. Counts are `env/unsettled`, the masked arms,
-            `env/episodes` that ended, and `env/successes` that ended at their goals.
+        These are means over the epoch, and counts: `env/unsettled`, the masked arms, `env/episodes` that
+        ended, and `env/successes` that ended at their goals.
         """
         n_steps = self.config.vector_steps_per_epoch
         state, metrics = jax.lax.scan(self._vector_step, state, jnp.arange(n_steps), length=n_steps)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections import ChainMap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+import calib.fit
 import mjx_softarm
 from calib.arm import CalibratedArm
-from calib.fit import payload
 from calib.fit.payload import effect_of_s2r, held_at
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support import xla
@@ -72,10 +71,8 @@ from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
-N_STEPS = 5  # steps that `arm_model` reports
 SEED = 0  # seed of equilibria, initial weights, batches and the workspace; it is not that of held-out poses
 ESTIMATORS_FILE, _KIND = "estimators.npz", "estimators"
-_NAMES = "estimator", "load_estimator", "spring_model"
 N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 2_048, 2_048
 # Share of the pressure range that is added at either end for poses. Much more brings sections that are about
 # to buckle, which no polynomial follows: with 0.25, the paper's arm has 3.7 mm at 95 % instead of 0.1.
@@ -88,7 +85,6 @@ PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which error
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
 WIDTH = 128  # width of the networks' hidden layers
 LEAST_SCALE = 1e-6  # least scale of an output off its plane: without a log, one variance holds everywhere
-# Median, 95 % and largest error ("median", "p95", "largest") by quantity and payload, such as "0.5 kg"
 Errors = dict[str, dict[str, dict[str, float]]]
 
 
@@ -96,7 +92,7 @@ class DistilledArm(NamedTuple):
     """A model of an arm, with the errors of its networks."""
 
     model: ArmModel
-    errors: Errors
+    errors: Errors  # "median", "p95" and "largest" by quantity and payload, such as "0.5 kg"
 
 
 _distilled: dict[str, DistilledArm] = {}  # by key, of this process
@@ -108,10 +104,7 @@ def arm_model(
     """Return the model of an arm, which is distilled once in a process.
 
     A file in `folder` keeps the model, and is used again for the same arm and the same code. `say` takes a
-    text before each of `N_STEPS` steps, of none where the model is kept.
-
-    Raises:
-        SpecError: the arm settles at too few pressures.
+    text before each step. Raises SpecError if the arm settles at too few pressures.
     """
     file, key = folder and folder / ESTIMATORS_FILE, _key(arm)
     if file and (kept := _read(file, key, arm)):
@@ -125,31 +118,24 @@ def arm_model(
 
 
 def distil(arm: CalibratedArm, say: Callable[[str], object] = lambda step: None) -> DistilledArm:
-    """Return the model of an arm, always the same for the same arm; `say` takes a text before each step.
-
-    Raises:
-        SpecError: the arm settles at too few pressures.
-    """
-    spec, keys = arm.spec, _keys()
+    """Return the model of an arm, always the same for the same arm; see `arm_model`."""
     say("fitting the pose estimator")
-    estimator = fit_pose(spec)
-    # Learn what holds the arm, with a payload and without, and the springs of the unloaded arm.
+    estimator = fit_pose(arm.spec)
     say("training the payload estimator")
     load_estimator = fit_load_estimator(arm)
     say("training the model of the springs")
-    unloaded = _as_measured(arm, sample_workspace(spec, N_TRAINING, SEED))
-    springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
+    spring_model = fit_spring_model(arm)
     say("simulating the workspace")
-    networks = estimator, load_estimator, springs
-    estimator, load_estimator, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), networks)
-    model = ArmModel(_workspace(spec, arm.s2r), estimator, load_estimator, springs, arm.s2r)
+    networks = estimator, load_estimator, spring_model
+    estimator, load_estimator, spring_model = jax.tree.map(lambda x: np.asarray(x, np.float32), networks)
+    model = ArmModel(_workspace(arm.spec, arm.s2r), estimator, load_estimator, spring_model, arm.s2r)
     say("testing them at held-out poses")
     return DistilledArm(model, _errors(model, arm))
 
 
 def fit_pose(spec: ArmSpec) -> PoseEstimator:
     """Return the pose estimator of an arm, least squares over simulated poses with payloads."""
-    # Poses, with the ends of their sections, and what these are off constant curvature
+    # Poses, with the ends of their sections, and how far these are off constant curvature
     pool = sample_loaded(_stronger(spec), _payloads(spec), 0.0, SEED)
     sections, ups = _sections(spec, pool.q)
     estimator = _first_estimator(spec)
@@ -195,22 +181,19 @@ def _sections(spec: ArmSpec, q: Array) -> tuple[Frame, np.ndarray]:
 
 def _first_estimator(spec: ArmSpec) -> PoseEstimator:
     """Return the pose estimator of an arm whose sections bend evenly, in double precision."""
-    params, n_sections = ArmParams.from_spec(spec), spec.structure.n_sections
-    mount = params.mount
-    fields = {
-        "coefficient": np.zeros((n_sections, N_TERMS, N_CHANGES)),
-        "variable_centre": np.zeros((n_sections, N_VARIABLES)),
-        "variable_scale": np.ones((n_sections, N_VARIABLES)),
-        "spring_site_m": params.spring_site_m,
-        "section_mass_kg": np.reshape(params.link_mass_kg, (n_sections, -1)).sum(axis=1),
-        "gripper_mass_kg": params.tool_mass_kg[0],
-        "tool_offset_m": params.tool_offset_m,
-        "base_position_m": mount.base_position_m,
-        "base_rotation": mount.base_rotation,
-        "tip_offset_m": mount.tip_offset_m,
-        "tip_rotation": mount.tip_rotation,
-    }
-    return PoseEstimator(**{name: np.asarray(value, float) for name, value in fields.items()})
+    params = ArmParams.from_spec(spec)
+    n_sections = params.n_sections
+    estimator = PoseEstimator(
+        coefficient=np.zeros((n_sections, N_TERMS, N_CHANGES)),
+        variable_centre=np.zeros((n_sections, N_VARIABLES)),
+        variable_scale=np.ones((n_sections, N_VARIABLES)),
+        spring_site_m=params.spring_site_m,
+        section_mass_kg=np.reshape(params.link_mass_kg, (n_sections, -1)).sum(axis=1),
+        gripper_mass_kg=params.tool_mass_kg[0],
+        tool_offset_m=params.tool_offset_m,
+        **params.mount._asdict(),
+    )
+    return jax.tree.map(lambda value: np.asarray(value, float), estimator)
 
 
 def _payloads(spec: ArmSpec) -> np.ndarray:
@@ -225,7 +208,7 @@ def _chambers_off(arm: CalibratedArm) -> float:
 
 
 def fit_load_estimator(arm: CalibratedArm) -> LoadEstimator:
-    """Return the payload network of an arm, learned at poses with payloads; see `distil`."""
+    """Return the payload network of an arm, learned at poses with payloads."""
     spec, _, held = arm
     loaded = sample_loaded(spec, _payloads(spec), _chambers_off(arm), SEED)
     own_kg, n_sections = spec.mass.payload_kg, spec.structure.n_sections
@@ -244,26 +227,34 @@ def fit_load_estimator(arm: CalibratedArm) -> LoadEstimator:
     held_at_kpa = light_kpa + left_kpa + spec.unmodelled_kpa
     # Learn, and judge by poses that are not learned
     out = np.float32(np.concatenate([held_at_kpa, effect, np.log(share)], axis=1))
-    parts = np.split(spring_m, [-N_JUDGING]), np.split(out, [-N_JUDGING])
-    learned, judging = (_Holding(*map(jnp.asarray, part)) for part in zip(*parts, strict=True))
+    split = ([jnp.asarray(part) for part in np.split(values, [-N_JUDGING])] for values in (spring_m, out))
+    (learned_m, judging_m), (learned, judging) = split
     keys = _keys()
-    first = _first_load_estimator(arm, learned.spring_m, learned.out, jnp.asarray(covariance), keys[3])
-    network = _fit(first, _holding_loss, learned, keys[4], n_schedules=LOAD_SCHEDULES)
+    first = _first_load_estimator(arm, learned_m, learned, jnp.asarray(covariance), keys[3])
+    network = _fit(first, _holding_loss, (learned_m, learned), keys[4], n_schedules=LOAD_SCHEDULES)
     # The network's own error. It is larger at the rim, so the intervals of 95 % of these poses shall hold it.
-    predicted_kpa = holding(network, judging.spring_m).pressure_kpa
-    true_kpa = judging.out[:, : spec.n_chambers]
+    predicted_kpa = holding(network, judging_m).pressure_kpa
+    true_kpa = judging[:, : spec.n_chambers]
     error = _square(predicted_kpa - true_kpa.reshape(predicted_kpa.shape))
     alone = network._replace(covariance_kpa2=jnp.zeros_like(error), error_kpa2=error)
-    estimated_kg, half_width_kg = estimate_load(alone, judging.spring_m, true_kpa)
+    estimated_kg, half_width_kg = estimate_load(alone, judging_m, true_kpa)
     widened = jnp.quantile(jnp.abs(estimated_kg - own_kg) / half_width_kg, 0.95) ** 2
     return network._replace(error_kpa2=widened * error)
 
 
-class _Holding(NamedTuple):
-    """Springs, and the outputs of `LoadEstimator` there."""
+def fit_spring_model(arm: CalibratedArm) -> SpringModel:
+    """Return the network from pressures to springs of an arm without a payload."""
+    pool, keys = _as_measured(arm, sample_workspace(arm.spec, N_TRAINING, SEED)), _keys()
+    first = SpringModel(
+        layers=initial_layers(keys[5], (arm.spec.n_chambers, WIDTH, WIDTH, arm.spec.n_springs)),
+        **_scaling("pressure", "kpa", pool.pressure_kpa),
+        **_scaling("spring", "m", pool.spring_m),
+    )
 
-    spring_m: Array  # (n, n_springs)
-    out: Array  # (n, n_out)
+    def loss(model: SpringModel, pool: Any) -> Array:
+        return jnp.mean((1e3 * (expected_springs(model, pool.pressure_kpa) - pool.spring_m)) ** 2)  # [mm^2]
+
+    return _fit(first, loss, pool, keys[6])
 
 
 def _square(off_kpa: Any) -> Any:
@@ -287,28 +278,16 @@ def _loaded(arm: CalibratedArm, many_kg: np.ndarray) -> Pool:
     light_kpa, own_kg = light.pressure_kpa[light.valid], arm.spec.mass.payload_kg
     effect_kpa = pool.pressure_kpa - light_kpa
     effect_kpa += (pool.load_kg - own_kg)[:, None] * effect_of_s2r(arm, pool.spring_m)
-    kpa = _held(arm, pool.spring_m, light_kpa, effect_kpa, np.random.default_rng([HELD_OUT_SEED, 2]))
-    return pool._replace(pressure_kpa=jnp.asarray(kpa, jnp.float32))
+    kpa = held_kpa(arm.held, pool.spring_m, light_kpa, effect_kpa, np.random.default_rng([HELD_OUT_SEED, 2]))
+    return pool._replace(pressure_kpa=jnp.asarray(kpa + arm.spec.unmodelled_kpa, jnp.float32))
 
 
 def _as_measured(arm: CalibratedArm, pool: Any) -> Any:
     """Return poses with the pressures that hold the real arm without a payload, as far as they are known."""
-    spring_m, kpa = np.asarray(pool.spring_m), np.asarray(pool.pressure_kpa)
-    return pool._replace(pressure_kpa=jnp.asarray(_held(arm, spring_m, kpa, np.zeros_like(kpa)), jnp.float32))
-
-
-def _held(
-    arm: CalibratedArm,
-    spring_m: np.ndarray,
-    light_kpa: np.ndarray,
-    effect_kpa: np.ndarray,
-    rng: np.random.Generator | None = None,
-) -> np.ndarray:
-    """Return the pressures that hold the real arm; see `held_kpa`."""
-    kpa = light_kpa + effect_kpa
+    kpa = np.asarray(pool.pressure_kpa)
     if arm.held is not None:
-        kpa = held_kpa(arm.held, spring_m, light_kpa, effect_kpa, rng)
-    return kpa + arm.spec.unmodelled_kpa
+        kpa = held_kpa(arm.held, np.asarray(pool.spring_m), kpa, np.zeros_like(kpa))
+    return pool._replace(pressure_kpa=jnp.asarray(kpa + arm.spec.unmodelled_kpa, jnp.float32))
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:
@@ -319,44 +298,35 @@ def _stronger(spec: ArmSpec) -> ArmSpec:
     return spec.replace(chambers=chambers)
 
 
-def _holding_loss(estimator: LoadEstimator, rows: _Holding) -> Array:
-    """Return the mean square of the outputs' errors, as shares of what a plane leaves."""
-    predicted = holding(estimator, rows.spring_m)
-    each = [x.reshape(len(rows.out), -1) for x in predicted]
-    off = (jnp.concatenate(each, axis=1) - rows.out) / estimator.out_scale
+def _holding_loss(estimator: LoadEstimator, rows: tuple[Array, Array]) -> Array:
+    """Return the mean square of the outputs' errors, as shares of what a plane leaves.
+
+    Rows are spring lengths (n, n_springs), and the outputs (n, n_out) of `LoadEstimator` there.
+    """
+    spring_m, out = rows
+    each = [x.reshape(len(out), -1) for x in holding(estimator, spring_m)]
+    off = (jnp.concatenate(each, axis=1) - out) / estimator.out_scale
     weight = jnp.ones(off.shape[1]).at[: each[0].shape[1]].set(PRESSURE_WEIGHT)
     return jnp.mean(weight * off**2)
 
 
-def _spring_loss(model: SpringModel, pool: Pool) -> Array:
-    """Return the mean square of the springs' errors [mm]."""
-    return jnp.mean((1e3 * (expected_springs(model, pool.pressure_kpa) - pool.spring_m)) ** 2)
-
-
-def _fit(
-    network: Any,
-    loss: Callable[[Any, Any], Array],
-    pool: Any,
-    key: Array,
-    n_schedules: int = 1,
-) -> Any:
+def _fit(network: Any, loss: Callable[[Any, Any], Array], rows: Any, key: Array, n_schedules: int = 1) -> Any:
     """Return the network with its layers trained; its other fields stay."""
     schedule = SCHEDULE._replace(n_updates=n_schedules * SCHEDULE.n_updates)
 
-    def loss_of(weights: Any, rows: Any) -> Array:
-        return loss(network._replace(layers=weights), rows)
+    def loss_of(layers: Any, rows: Any) -> Array:
+        return loss(network._replace(layers=layers), rows)
 
-    weights, _ = train_network(loss_of, network.layers, pool, schedule, key)
-    return network._replace(layers=weights)
+    layers, _ = train_network(loss_of, network.layers, rows, schedule, key)
+    return network._replace(layers=layers)
 
 
 def _first_load_estimator(
     arm: CalibratedArm, spring_m: Array, out: Array, covariance_kpa2: Array, key: Array
 ) -> LoadEstimator:
-    """Return the payload network of an arm, with the plane that fits its outputs best.
+    """Return the payload network of an arm, with the plane that fits its outputs (n, n_out) best.
 
-    `out` (n, n_out) are the outputs of `LoadEstimator` at spring lengths (n, n_springs). The arm's residual
-    pressures, with covariance (n_sections, c, c), tell the hysteresis.
+    `covariance_kpa2` (n_sections, c, c) is that of the arm's residual pressures.
     """
     scaling, centre = _scaling("spring", "m", spring_m), jnp.mean(out, axis=0)
     springs = (spring_m - scaling["spring_centre_m"]) / scaling["spring_scale_m"]
@@ -377,16 +347,6 @@ def _first_load_estimator(
         own_load_kg=jnp.asarray(own_kg),
         load_scale_kg=jnp.asarray(own_kg + arm.spec.mass.largest_payload_kg),
         factor_sd=jnp.asarray(COMMON_FACTOR if held is None else held.factor_sd),
-    )
-
-
-def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
-    """Return the network from pressures to springs, scaled by poses of an arm."""
-    n_chambers, n_springs = pool.pressure_kpa.shape[1], pool.spring_m.shape[1]
-    return SpringModel(
-        layers=initial_layers(key, (n_chambers, WIDTH, WIDTH, n_springs)),
-        **_scaling("pressure", "kpa", pool.pressure_kpa),
-        **_scaling("spring", "m", pool.spring_m),
     )
 
 
@@ -439,10 +399,10 @@ def _errors(learned: ArmModel, arm: CalibratedArm) -> Errors:
 
 def _write(file: Path, key: str, arm: DistilledArm) -> None:
     """Keep a model in a file, with the key of its arm; the sim-to-real network has a file of its own."""
-    networks = [entries_of(name, getattr(arm.model, name)) for name in _NAMES]
-    others = {"key": key, "errors_json": json.dumps(arm.errors), "workspace": arm.model.workspace}
-    entries = {name: np.asarray(value) for name, value in others.items()}
-    write_sealed(file, dict(ChainMap(entries, *networks)), _KIND)
+    entries = {"key": key, "errors_json": json.dumps(arm.errors), "workspace": arm.model.workspace}
+    for name in ("estimator", "load_estimator", "spring_model"):
+        entries |= entries_of(name, getattr(arm.model, name))
+    write_sealed(file, entries, _KIND)
 
 
 def _read(file: Path, key: str, arm: CalibratedArm) -> DistilledArm | None:
@@ -469,11 +429,8 @@ def _key(arm: CalibratedArm) -> str:
     digest = hashlib.sha256(json.dumps([*settings, SCHEDULE, PAYLOADS, jax.__version__]).encode())
     for values in jax.tree.leaves((arm.s2r, arm.held)):
         digest.update(np.asarray(values).tobytes())
-    package = Path(mjx_softarm.__file__).parent
-    folders = (
-        *(package / name for name in ("_support", "mechanics", "sensing")),
-        Path(payload.__file__).parent,
-    )
+    package, fit = (Path(module.__path__[0]) for module in (mjx_softarm, calib.fit))
+    folders = (package / "_support", package / "mechanics", package / "sensing", fit)
     modules = (file for folder in folders for file in sorted(folder.glob("*.py")))
     for source in (package / "spec.py", Path(__file__), *modules):
         digest.update(source.read_bytes())

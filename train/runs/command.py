@@ -26,7 +26,7 @@ from train.options import ArmOptions, start
 from train.presets import IMITATION_PRESETS, PRESETS, preset_of
 from train.runs import run as runs
 from train.runs.evaluate import N_ACTIONS
-from train.runs.folder import Run, sole_trainer
+from train.runs.folder import Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,16 +116,12 @@ class Imitate(NewRunOptions):
             return _resume(self, self.resume, console)
         if self.file is None:
             raise InputError("FILE: got nothing, expected the demonstrations, or --resume RUN")
-        # Settings of the learned reward, which may be another run's.
         learner = cast(ImitationConfig, self.config.learner)
-        learner = dataclasses.replace(learner, frozen=learner.frozen or self.reward is not None)
-        if learner.frozen and not self.reward:
-            expected = "--reward RUN, the run whose learned reward it takes"
-            raise InputError(f"learner.frozen: got true, expected {expected}")
         if self.reward and not learner.learned_weight:
             raise InputError(
                 f"learner.learned_weight: got 0 with --reward {self.reward}, expected more, for its reward"
             )
+        learner = dataclasses.replace(learner, frozen=self.reward is not None)
         config = dataclasses.replace(self.config, learner=learner)
         donors = {"agent": self.agent, "reward": self.reward}
         return _begin("imitate", self, config, donors, console, self.file)
@@ -157,11 +153,7 @@ def evaluate(
             pictures [g]
         in_motion: evaluate on arms in motion, with actions of this duration; without pictures [s]
         actions: number of actions towards each goal, in motion; None: 4
-
-    Raises:
-        InputError: the payload or the number of actions is out of range.
     """
-    # Check the options.
     if not 0.0 <= payload < math.inf:
         raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if actions is not None and (actions < 1 or in_motion is None):
@@ -195,7 +187,7 @@ def evaluate(
     _table(f"{task.evaluate.title}, {how}", summary, console)
     file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())
-    console.print(f"written: {file}", soft_wrap=True)
+    console.print(f"written: {file}")
     return 0
 
 
@@ -236,15 +228,14 @@ def _resume(options: Reach | Imitate, path: Path, console: Console) -> int:
     run = Run.open(path)
     if run.checkpoints.latest is None:
         run.check_begins_anew()
-        console.print(f"{path}: no checkpoint yet, the run begins anew", soft_wrap=True)
+        console.print(f"{path}: no checkpoint yet, the run begins anew")
     return _train(run, runs.task_of_run(run), console)
 
 
 def _train(run: Run, task: runs.Task, console: Console) -> int:
-    console.print(f"run: {run.path}", soft_wrap=True)
+    console.print(f"run: {run.path}")
     try:
-        with sole_trainer(run.path):
-            summary = runs.train(run, task, console)
+        summary = runs.train(run, task, console)
     except runs.Interrupted as stop:
         console.print(str(stop))
         return cli.INTERRUPTED
@@ -255,7 +246,7 @@ def _train(run: Run, task: runs.Task, console: Console) -> int:
 def _show(run: Run, task: runs.Task, summary: Any, console: Console) -> None:
     _table(f"{task.evaluate.title}, {N_ACTIONS} actions each", summary, console)
     for picture in sorted(run.path.glob("*.png")):
-        console.print(f"picture: {picture}", soft_wrap=True)
+        console.print(f"picture: {picture}")
 
 
 def _table(title: str, summary: Any, console: Console) -> None:
@@ -263,4 +254,4 @@ def _table(title: str, summary: Any, console: Console) -> None:
     table.add_column("value", justify="right")
     for row in summary.rows():
         table.add_row(*row)
-    console.print(table)
+    console.print(table, soft_wrap=False)

@@ -30,7 +30,6 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from calib.arm import CalibratedArm
 from mjx_softarm._support import cli
@@ -56,6 +55,7 @@ from mjx_softarm.policy.file import (
 )
 from mjx_softarm.sensing.estimator import POSE_ERROR_MM
 from mjx_softarm.spec import ArmSpec
+from train.options import ArmOptions, start
 from train.runs.folder import DEMONSTRATIONS_FILE, Run
 
 if TYPE_CHECKING:
@@ -97,12 +97,11 @@ def export(
     others = {"--out": out, "--onnx": onnx, "--cpp": cpp, "--calibration": calibration}
     if weights and (given := [name for name, value in others.items() if value]):
         raise InputError(f"--weights: got {' and '.join(given)} too, expected it alone")
-    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console = start()
     if not weights:
         n_enough = sum(_export(path, out, onnx, cpp, calibration, console) for path in folders)
         return 0 if n_enough == len(folders) else 1
-    folder = next(iter(folders))
-    entries = actor_entries(Run.open(folder))
+    entries = actor_entries(Run.open(next(iter(folders))))
     write_sealed(weights, entries, WEIGHTS)
     layers = [entries[f"actor.{k}.weight"] for k in range(int(entries["actor.n_layers"]))]
     console.print(f"weights: {weights}, {_size(weights)}: actor {_widths(layers)}")
@@ -114,10 +113,8 @@ def _export(
 ) -> bool:
     """Write the policy of a run; return whether it needs no training on a later calibration."""
     from mjx_softarm.export.write import export_cpp, export_onnx
-    from train.options import ArmOptions, start
-    from train.runs.arm_model import N_STEPS, arm_model
+    from train.runs.arm_model import arm_model
 
-    start()
     run, file, keeps, enough = Run.open(path), out, path, True
     actor_of(run)  # before the networks are distilled, which takes a minute
     # A later calibration takes the place of the run's
@@ -125,19 +122,9 @@ def _export(
         later = renewed(run, ArmOptions(calibration=calibration).read_arm(console))
         enough = policy_still_accurate(run, later, calibration, console)
         run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
-    # Distil the arm's networks, unless they are kept
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("reading the arm's networks", total=N_STEPS)
-
-        def say(step: str) -> None:
-            progress.update(bar, description=step, advance=1)
-            if not console.is_terminal:
-                console.print(f"{step} ...")
-
-        arm = arm_model(run.arm, keeps, say)
+    # Distil the arm's networks, unless they are kept; write the policy and say what it holds
+    arm = arm_model(run.arm, keeps, lambda step: console.print(f"{step} ..."))
     policy = export_run(run, arm, file)
-    # Say what was written
     console.print(f"policy: {policy}, {_size(policy)}")
     for line in contents(load_policy(policy)):
         console.print(f"  {line}")
@@ -147,12 +134,9 @@ def _export(
 
 
 def renewed(run: Run, arm: CalibratedArm) -> Run:
-    """Return a run with another calibration of its arm.
+    """Return a run with another calibration of its arm; raise InputError if it is another arm.
 
     Its actions stay readings of the same spring lengths: the range of lengths remains that of the training.
-
-    Raises:
-        InputError: it is another arm.
     """
     counts = [(spec.structure.n_sections, spec.n_chambers, spec.n_springs) for spec in (run.spec, arm.spec)]
     if counts[0] != counts[1]:
@@ -192,7 +176,7 @@ def policy_still_accurate(before: Run, now: Run, calibration: Path, console: Con
     task = f"imitate {before.path / DEMONSTRATIONS_FILE}" if shown else "reach"
     preset = before.origin()["preset"]
     options = f"--agent {before.path} --calibration {calibration}" + (f" --preset {preset}" if preset else "")
-    console.print(f"NOT enough: go on training: python -m train {task} {options}", soft_wrap=True)
+    console.print(f"NOT enough: go on training: python -m train {task} {options}")
     return False
 
 
@@ -215,14 +199,12 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
     Raises:
         InputError: the policy is not one that the file can hold, or the file cannot be written.
     """
-    # Say how the policy came about: the run's config with versions and commit, and the arm's networks.
     provenance = {
         **run.origin(),
         "epoch": run.checkpoints.latest,
         "estimator_errors": arm.errors,
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    # Put all together; this checks the shapes of the parameters.
     env = run.config.env
     try:
         policy = policy_from_actor(
@@ -244,11 +226,7 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
 
 
 def actor_of(run: Run) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Return weight and bias of each layer of a run's newest actor.
-
-    Raises:
-        InputError: the run has no checkpoint, or its policy is not a network that an export can hold.
-    """
+    """Return weight and bias of each layer of a run's newest actor; raise InputError if it has no such."""
     try:
         return actor_layers(run.policy(), run.spec)
     except (ValueError, AttributeError) as error:
@@ -258,9 +236,7 @@ def actor_of(run: Run) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
 def actor_entries(run: Run) -> dict[str, np.ndarray]:
     """Return the entries of the file with a run's actor alone; the module lists them.
 
-    Raises:
-        InputError: see `actor_of`.
-        SealedFileError: a layer has another size than observation or action, or is not finite.
+    Raises InputError for an actor of other sizes than observation and action, or that is not finite.
     """
     spec, env = run.spec, run.config.env
     layout, actions = layouts(spec)[env.observation], ActionMap.from_spec(spec)

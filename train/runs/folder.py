@@ -72,29 +72,27 @@ class Checkpoints:
         self._manager.save(epoch, args=ocp.args.Composite(**saved))
         self._manager.wait_until_finished()
 
-    def restore(self, like: Any) -> tuple[int, Any]:
-        """Return the newest checkpoint: epochs done, and state, structured as the state or shapes `like`.
+    def restore(self, like: Any, epoch: int | None = None) -> Any:
+        """Return the state after an epoch, by default the newest, structured as the state or shapes `like`.
 
-        Raises:
-            InputError: there is no checkpoint, or it cannot be read.
+        Raises InputError if there is no checkpoint, or it cannot be read.
         """
-        return self._newest("state", ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like)))
+        shapes = jax.tree.map(_shape_somewhere, like)
+        return self._read("state", ocp.args.StandardRestore(shapes), epoch)
 
     def parts(self) -> dict[str, Any]:
         """Return the newest checkpoint's parts of the learner as NumPy arrays; see `Learner.parts`.
 
-        Raises:
-            InputError: there is no checkpoint, or it cannot be read.
+        Raises InputError as `restore` does.
         """
-        return self._newest("parts", ocp.args.StandardRestore())[1]
+        return self._read("parts", ocp.args.StandardRestore())
 
-    def _newest(self, item: str, how: ocp.args.CheckpointArgs) -> tuple[int, Any]:
-        """Return the number of epochs behind the newest checkpoint, and an item of it."""
-        epoch = self.latest
+    def _read(self, item: str, how: ocp.args.CheckpointArgs, epoch: int | None = None) -> Any:
+        epoch = self.latest if epoch is None else epoch
         if epoch is None:
             raise InputError(f"{self.run}: got no checkpoint, expected one; start the run anew")
         try:
-            return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
+            return self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
         except Exception as error:
             folder = self.path / str(epoch)
             if _is_damage(folder / item, error):
@@ -135,10 +133,9 @@ def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
 class Run:
     """The folder of one run.
 
-    `config.json` (settings, arm, preset, versions, commit), `s2r.npz` and `pressures.npz` (models of the
-    arm's calibration, if it has them), `demonstrations.npz` (if it learns from them), `checkpoints/`,
-    `metrics.jsonl`, `evaluation.json`, pictures, TensorBoard's event files and, once exported, `policy.npz`
-    and `estimators.npz`.
+    It has `config.json` (settings, arm, preset, versions, commit), the models of the arm's calibration,
+    `demonstrations.npz` (if it learns from them), `checkpoints/`, `metrics.jsonl`, `evaluation.json`,
+    pictures, TensorBoard's event files and, once exported, `policy.npz` and `estimators.npz`.
     """
 
     def __init__(self, path: Path, config: TrainConfig, arm: CalibratedArm):
@@ -162,7 +159,7 @@ class Run:
         first: tuple[Any, dict[str, Any]] | None = None,
         preset: str | None = None,
     ) -> Run:
-        """Start a folder.
+        """Start a folder; raise InputError if it holds a run already, or cannot be made.
 
         Args:
             path, config, arm: folder to make, all settings, and the arm.
@@ -170,9 +167,6 @@ class Run:
             begins_with: folders of other runs whose parts the first state has, by part.
             first: first state with its parts, if it is not drawn from the seed.
             preset: name of the settings that these began with, if they have one.
-
-        Raises:
-            InputError: the folder already holds a run, or cannot be made.
         """
         if (path / CONFIG_FILE).exists():
             raise InputError(
@@ -204,12 +198,7 @@ class Run:
 
     @classmethod
     def open(cls, path: Path) -> Run:
-        """Open an existing folder.
-
-        Raises:
-            InputError: there is no run in it, or its config cannot be read.
-            SealedFileError: a model of its calibration cannot be read.
-        """
+        """Open an existing folder; raise InputError if there is no run in it, or a file cannot be read."""
         file = path / CONFIG_FILE
         try:
             data = json.loads(file.read_text("utf-8"))
@@ -232,11 +221,7 @@ class Run:
         return json.loads((self.path / CONFIG_FILE).read_text("utf-8"))
 
     def demonstrations(self) -> Demonstrations | None:
-        """Return the demonstrations that the run learns from, or None.
-
-        Raises:
-            LogError: its file cannot be used.
-        """
+        """Return the demonstrations that the run learns from, or None; see `load_demonstrations`."""
         if not self.config.learner.FROM_DEMONSTRATIONS:
             return None
         return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
@@ -246,11 +231,7 @@ class Run:
         return self.checkpoints.parts()["policy"]
 
     def check_begins_anew(self) -> None:
-        """Check that a run without a checkpoint was stopped before its first one.
-
-        Raises:
-            InputError: it had a checkpoint: it began with another run's, or its metrics go further.
-        """
+        """Raise InputError if a run without a checkpoint had one: it began so, or its metrics go further."""
         done = max((row["epoch"] for row in self.metrics()), default=0)
         # A process may have died after the metrics of an epoch and before its checkpoint.
         if self.origin()["begins_with"] or any(map(self.config.evaluates_after, range(1, done))):
@@ -283,11 +264,7 @@ class Run:
 
 @contextlib.contextmanager
 def sole_trainer(path: Path) -> Iterator[None]:
-    """Lock a folder while training in it; a killed process releases the lock.
-
-    Raises:
-        InputError: another process holds it.
-    """
+    """Lock a folder while training in it, or raise InputError; a killed process releases the lock."""
     with open(path / LOCK_FILE, "w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,9 +26,7 @@ from train.config import TrainConfig, name_of
 from train.demos.demonstrations import Demonstrations
 from train.epoch.job import Job, State
 from train.runs.evaluate import Evaluator, PositionEvaluator
-from train.runs.folder import EVALUATION_FILE, Run
-
-SLOW_S = 3.0  # longer work than this is announced
+from train.runs.folder import EVALUATION_FILE, Run, sole_trainer
 
 
 class Task(NamedTuple):
@@ -43,8 +40,7 @@ class Task(NamedTuple):
 def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations | None = None) -> Task:
     """Return the task of a run: to reach the whole workspace, or positions as an expert showed.
 
-    Raises:
-        InputError: the learner needs demonstrations and has none.
+    Raises InputError if the learner needs demonstrations and has none.
     """
     epoch: Any = config.learner.make_epoch(env, demonstrations)
     if demonstrations is None:
@@ -63,11 +59,7 @@ def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations |
 
 
 def task_of_run(run: Run) -> Task:
-    """Return the task of a run.
-
-    Raises:
-        InputError: its demonstrations cannot be read.
-    """
+    """Return the task of a run; raise InputError if its demonstrations cannot be read."""
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.arm.s2r), run.demonstrations())
 
 
@@ -105,51 +97,50 @@ class Interrupted(Exception):
 def train(run: Run, task: Task, console: Console) -> Any:
     """Train to the end of the run's config, from its newest checkpoint if it has one; return final figures.
 
-    Raises:
-        Interrupted: after Ctrl-C or a termination signal, once the state is saved.
-        InputError: arms in motion diverge.
+    Raises as `train_together` does.
     """
+    job, learner = task.job, run.config.learner
 
-    def begin() -> tuple[int, State]:
-        learner = run.config.learner
+    def first() -> State:
+        if run.checkpoints.latest is None:
+            return job.init(jax.random.PRNGKey(run.config.seed))
+        return run.checkpoints.restore(job.shapes())
+
+    def begin() -> State:
         console.print(
             f"compiling an epoch of {learner.n_arms} arms with updates of {name_of(learner)} "
             "(cached for the next start) ..."
         )
-        epoch, state = task.job.start(first)
-        run.rewind(epoch)
-        return epoch, state
+        return job.start(first)
 
-    def first() -> tuple[int, State]:
-        if run.checkpoints.latest is None:
-            return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
-        return run.checkpoints.restore(task.job.shapes())
-
-    (summary,) = train_together(task.job, [(run, task)], begin, run.path, console)
+    (summary,) = train_together(job, [(run, task)], begin, run.path, console)
     return summary
 
 
 def train_together(
     job: Any,
     members: Sequence[tuple[Run, Task]],
-    begin: Callable[[], tuple[int, State]],
+    begin: Callable[[], State],
     path: Path,
     console: Console,
     member: Callable[[State, int], State] = lambda state, k: state,
 ) -> list[Any]:
     """Train all members of one job, a run or the runs of a sweep, to their end; return their final figures.
 
-    `begin` deletes what is later than the state to begin with, and returns the number of epochs done and this
-    state. `member` takes the state of the k-th member from the job's. `--resume` continues the folder `path`.
+    `begin` returns the state to begin with; later checkpoints and metrics are deleted. `member` takes the
+    state of the k-th member from the job's. `--resume` continues the folder `path`.
 
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
-        InputError: arms in motion diverge.
+        InputError: arms in motion diverge, or another process trains in the folder.
     """
     (first, shared), learner = members[0], job.learner
     config, n_epochs = first.config, first.config.learner.n_epochs
-    with asked_to_stop() as asked, ExitStack() as stack:
-        epoch, state = begin()
+    with sole_trainer(path), asked_to_stop() as asked, ExitStack() as stack:
+        state = begin()
+        epoch = int(state.n_epochs)
+        for run, _ in members:
+            run.rewind(epoch)
         if epoch:
             console.print(f"continuing after epoch {epoch} of {n_epochs}")
         later = config.learner.n_env_steps(epoch) + 1 if epoch else None  # events that a stopped run has left
@@ -169,8 +160,7 @@ def train_together(
                 refuse_divergence(run.config, row["env/unsettled"])
                 member_state = member(state, k) if due or stop else None
                 if member_state is not None and due:
-                    with noted(console, "compiling the evaluation ..."):
-                        figures = task.evaluate(learner.policy(member_state.learner))[0].to_dict()
+                    figures = task.evaluate(learner.policy(member_state.learner))[0].to_dict()
                     row |= {f"evaluation/{n}": x for n, x in figures.items() if not isinstance(x, tuple)}
                 record(run, board, epoch, row)
                 if member_state is not None:
@@ -178,9 +168,8 @@ def train_together(
             show(epoch, _line(rows, shared), due)
             if stop and epoch < n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {path}")
-    return [
-        finish(run, task, learner.policy(member(state, k).learner)) for k, (run, task) in enumerate(members)
-    ]
+    policies = [learner.policy(member(state, k).learner) for k in range(len(members))]
+    return [finish(*each, policy) for each, policy in zip(members, policies, strict=True)]
 
 
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
@@ -191,17 +180,6 @@ def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
             f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
             f"{n_actions} actions diverged, expected a shorter time step for this arm"
         )
-
-
-@contextmanager
-def noted(console: Console, text: str) -> Iterator[None]:
-    """Print a text if the work inside takes longer than `SLOW_S`, as the first call of a program may."""
-    timer = threading.Timer(SLOW_S, console.print, [text])
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def finish(run: Run, task: Task, policy: Any) -> Any:
@@ -218,10 +196,8 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
 def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[State, dict[str, Any]]:
     """Return the state that a new run begins with, and its parts; some of these are another run's.
 
-    Networks are those of the donor `agent`, the learned reward is that of the donor `reward`.
-
-    Raises:
-        InputError: a donor has no such part, or one of another size.
+    Networks are those of the donor `agent`, the learned reward is that of the donor `reward`. Raises
+    InputError for a donor without such a part, or with one of another size.
     """
     state, learner = task.job.init(jax.random.PRNGKey(seed)), task.job.learner
     for option, donor in donors.items():

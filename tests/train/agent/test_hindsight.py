@@ -29,7 +29,10 @@ def transition(env, reset, step, random_actions):
     action = jnp.where(
         kind < 2, random_actions, jnp.where(kind == 2, elsewhere, env.action_of(env.pool.spring_m))
     )
-    return state, action, step(state, action)
+    after = step(state, action)
+    saturated, reached = (np.asarray(x) > 0 for x in (after.info["saturated"], after.done))
+    assert min(saturated.sum(), reached.sum(), (~saturated & ~reached).sum()) > 100
+    return state, action, after
 
 
 @pytest.fixture(scope="module")
@@ -57,13 +60,6 @@ def goal_of(env, obs):
     return obs[:, 6:12] * env.scale.scale + env.scale.centre
 
 
-def test_the_transitions_hold_every_case(transition):
-    _, _, after = transition
-    saturated, reached = (np.asarray(x) > 0 for x in (after.info["saturated"], after.done))
-    assert min(saturated.sum(), reached.sum(), (~saturated & ~reached).sum()) > 100
-    assert np.asarray(after.info["valid"]).all()
-
-
 def test_with_both_shares_zero_a_batch_is_what_the_environment_gave(transition, relabelled):
     state, action, after = transition
     _, batch = relabelled(reached_share=0.0, near_share=0.0)
@@ -82,23 +78,20 @@ def test_a_pose_that_was_reached_as_a_goal_earns_the_bonus_and_ends_the_episode(
     np.testing.assert_array_equal(batch.next_obs[:, 12:], 0.0)
 
 
-def test_only_a_saturated_action_is_exchanged_for_the_sensed_one(relabelled):
+def test_only_a_saturated_action_is_exchanged_for_the_sensed_one(env, relabelled):
     many, batch = relabelled(reached_share=0.5, near_share=0.5)
     np.testing.assert_array_equal(
         batch.action, jnp.where(many.saturated[:, None], many.sensed_action, many.action)
     )
     assert float(jnp.abs(many.sensed_action - many.action)[many.saturated].max()) > 0.5
     assert -100.0 not in np.asarray(batch.reward)
-
-
-def test_as_printed_actions_stay_and_a_reached_pose_pays_though_a_chamber_saturates(env, relabelled):
-    settings, pays = {"reached_share": 1.0, "exchange_actions": False}, env.config.reward
-    many, batch = relabelled(saturation_costs=False, **settings)
-    np.testing.assert_array_equal(batch.action, many.action)
-    np.testing.assert_array_equal(batch.reward, pays.goal_bonus)
-    _, batch = relabelled(**settings)
-    costs = np.where(many.saturated, -pays.saturation_cost, pays.goal_bonus)
-    np.testing.assert_array_equal(batch.reward, costs)
+    # As printed, actions stay, and a pose reached pays though a chamber saturates.
+    for costs in (False, True):
+        settings = {"exchange_actions": False, "saturation_costs": costs}
+        many, batch = relabelled(reached_share=1.0, **settings)
+        np.testing.assert_array_equal(batch.action, many.action)
+        paid = np.where(costs & np.asarray(many.saturated), -100.0, env.config.reward.goal_bonus)
+        np.testing.assert_array_equal(batch.reward, paid)
 
 
 def test_a_sensed_action_leads_to_the_same_rest_with_no_chamber_saturated(transition, stored, step):
@@ -112,7 +105,7 @@ def test_a_sensed_action_leads_to_the_same_rest_with_no_chamber_saturated(transi
     assert float(after.metrics["saturated_chambers"].sum()) > 500
 
 
-def test_near_goals_lie_at_log_uniform_distances_within_the_bounds(env, relabelled):
+def test_near_goals_lie_at_log_uniform_distances_and_earn_what_these_say(env, relabelled):
     many, batch = relabelled(reached_share=0.0, near_share=1.0)
     offset = np.asarray(goal_of(env, batch.obs) - many.next_pose)
     distance = np.linalg.norm(offset[:, :3], axis=1)
@@ -123,11 +116,8 @@ def test_near_goals_lie_at_log_uniform_distances_within_the_bounds(env, relabell
     direction = offset[:, :3] / distance[:, None]
     assert abs(direction.mean(axis=0)).max() < 5 * np.sqrt(1 / 3 / len(direction))
     assert abs((direction**2).mean(axis=0) - 1 / 3).max() < 0.03
-
-
-def test_near_goals_earn_what_their_distance_says(env, relabelled):
-    many, batch = relabelled(reached_share=0.0, near_share=1.0)
-    offset = np.asarray(many.next_pose - goal_of(env, batch.obs), np.float64)
+    # They earn what their distance says.
+    offset = -offset.astype(np.float64)
     offset[:, 3:] = (offset[:, 3:] + 180.0) % 360.0 - 180.0
     norm = np.linalg.norm(offset * ([0.0056] * 3 + [0.001] * 3), axis=1)
     clear = abs(norm - 0.03) > 1e-4  # of the threshold, where rounding decides

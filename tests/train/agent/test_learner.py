@@ -125,7 +125,7 @@ def arm(make_arm_model):
 def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, arm):
     policy = load_policy(export_run(run, arm, tmp_path / "policy.npz"))
     shapes = task.job.shapes()
-    params = task.job.learner.policy(run.checkpoints.restore(shapes)[1].learner)
+    params = task.job.learner.policy(run.checkpoints.restore(shapes).learner)
     obs = np.random.default_rng(0).normal(size=(8, 18)).astype(np.float32)
     (first, bias), (head, head_bias) = policy.layers
     expected = np.tanh(np.maximum(obs @ first + bias, 0.0) @ head + head_bias)
