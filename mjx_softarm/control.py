@@ -37,7 +37,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
@@ -81,13 +80,12 @@ def chambers_of_springs(spec: ArmSpec) -> np.ndarray:
 
     A chamber's length is that of the plane through its section's springs, at the chamber's own radius.
     """
-    n_chambers, n_springs = spec.structure.chambers_per_section, spec.springs_per_section
+    c, s = spec.structure.chambers_per_section, spec.springs_per_section
+    matrix = np.zeros((spec.structure.n_sections, c, spec.structure.n_sections, s))
     radii = map(spec.per_section, (spec.geometry.chamber_radius_m, spec.geometry.spring_radius_m))
-    blocks = (
-        planes(n_chambers, chamber) @ np.linalg.pinv(planes(n_springs, spring))
-        for chamber, spring in zip(*radii, strict=True)
-    )
-    return np.asarray(block_diag(*blocks))
+    for section, (chamber, spring) in enumerate(zip(*radii, strict=True)):
+        matrix[section, :, section] = planes(c, chamber) @ np.linalg.pinv(planes(s, spring))
+    return matrix.reshape(spec.n_chambers, spec.n_springs)
 
 
 class Gains(NamedTuple):
