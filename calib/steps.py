@@ -60,7 +60,7 @@ def _not_fitted(
     arm: CalibratedArm, title: str, why: str, *warnings: str, notes: tuple[str, ...] = ()
 ) -> StepResult:
     """Return the result of a step without enough data."""
-    text = f"Not fitted: the specification's values stay. {why}"
+    text = f"Not fitted. {why}"
     return StepResult(arm, Section(title, text, warnings=warnings, notes=notes))
 
 

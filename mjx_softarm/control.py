@@ -183,7 +183,13 @@ def saturated(
     """Return which chambers (..., n_chambers) cannot reach their reference: bool.
 
     A chamber is saturated if it is at its greatest pressure with its spring too short, or at its least
-    pressure with its spring too long, by more than the tolerance. The arguments are those of `pressures`.
+    pressure with its spring too long, by more than the tolerance.
+
+    Args:
+        pressure_kpa (..., n_chambers): pressures of the law.
+        reference_m, length_m (..., n_springs): references and lengths of the springs.
+        gains: limits, and how redundant chambers share the springs' errors.
+        tolerance_m: error of a spring that does not count.
     """
     error_m = allocated_error(reference_m - length_m, pressure_kpa, gains.allocation)
     short = (pressure_kpa >= gains.pressure_max_kpa) & (error_m > tolerance_m)

@@ -20,13 +20,13 @@ from mjx_softarm._support.fields import (
     PerSection,
     SpecError,
     anything,
-    check_counts,
     count,
     not_negative,
     numbers,
     positive,
     read_fields,
     vector,
+    wrong_counts,
 )
 from mjx_softarm.arms import shipped_arm
 from mjx_softarm.pneumatics import ACTUATORS, PAPER_PUMP, Actuators, Pneumatics
@@ -53,8 +53,8 @@ class Structure:
 
     n_sections: int = count()
     links_per_section: int = count()
-    chambers_per_section: int = count(3, low=LEAST_CHAMBERS, high=MOST_CHAMBERS)
-    springs_per_section: int = count(0, low=0, high=MOST_CHAMBERS)  # 0: one beside each chamber
+    chambers_per_section: int = count(default=3, low=LEAST_CHAMBERS, high=MOST_CHAMBERS)
+    springs_per_section: int = count(default=0, low=0, high=MOST_CHAMBERS)  # 0: one beside each chamber
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Chambers:
     length_offset_m: PerChamber = anything(per="chambers", low=-0.1, high=0.1)
     pressure_min_kpa: float = anything(low=-101.325, **PRESSURE)
     pressure_max_kpa: float = anything(low=-101.325, **PRESSURE)
-    bonded_share: float = anything(0.0, low=BONDS[0], high=BONDS[1])
+    bonded_share: float = anything(default=0.0, low=BONDS[0], high=BONDS[1])
 
 
 @dataclass(frozen=True)
@@ -315,11 +315,8 @@ class ArmSpec:
             SpecError: a field is missing, unknown, of the wrong type or out of range.
         """
         spec = cls(**read_fields(cls, data, f"{source}: "))
-        n_sections = spec.structure.n_sections
-        counts = {"sections": n_sections, "chambers": spec.n_chambers, "springs": spec.n_springs}
-        check_counts(spec, counts, f"{source}: ")
-        for contradiction in spec._contradictions():
-            raise SpecError(f"{source}: {contradiction}")
+        if problem := next(spec._contradictions(), None):  # the first explains the others
+            raise SpecError(f"{source}: {problem}")
         return spec
 
     def to_dict(self) -> dict[str, Any]:
@@ -360,6 +357,11 @@ class ArmSpec:
                 f"structure.springs_per_section: got {springs}, expected 0 for one beside each chamber, "
                 f"or {LEAST_CHAMBERS} or more that divide the {n} chambers"
             )
+
+        # Lists have the right number of entries
+        n_sections = self.structure.n_sections
+        counts = {"sections": n_sections, "chambers": self.n_chambers, "springs": self.n_springs}
+        yield from wrong_counts(self, counts)
 
         # A negative bond leaves the backbone some stiffness
         backbone = self.backbone.axial_stiffness_n_per_m, self.backbone.bending_stiffness_nm_per_rad

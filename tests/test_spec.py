@@ -41,11 +41,18 @@ def test_a_negative_bond_leaves_the_backbone_its_stiffness(spec):
 def test_default_is_the_paper_s_arm(spec):
     """Its file holds each number; mass and coil are derived from what the paper prints."""
     assert (spec.name, spec.structure.n_sections) == ("paper", 3)
+    assert (spec.geometry.chamber_diameter_m, spec.mass.gripper_kg) == (0.06, 0.45)
+    assert (spec.sensor.beta, spec.sensor.delta_m, spec.control.rate_hz) == (0.93, 2.45e-3, 50.0)
     assert spec.mass.arm_kg + spec.mass.gripper_kg == pytest.approx(4.7)
     assert spec.sensor.coil_radius_m == pytest.approx((4.0 - 0.4) / 2 * 1e-3)
     assert spec.mass.largest_payload_kg == 1.0
     small = ArmSpec.of(Path("sopra")).mass  # in proportion to the arms' masses
     assert small.largest_payload_kg == pytest.approx((sum(small.arm_kg) + small.gripper_kg) / 4.7)
+
+
+def test_a_count_is_refused_before_the_lists_that_follow_it(spec):
+    changes = {"sensor": {"beta": [0.93] * 9}, "structure": {"springs_per_section": 2}}
+    assert message_of(spec.replace, **changes).startswith("replace: structure.springs_per_section: got 2, ")
 
 
 REFUSED = [

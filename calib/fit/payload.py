@@ -145,7 +145,7 @@ def estimated_payload(
         pressure_kpa (m, n_chambers) [kPa]: measured pressures.
     """
     (at, _), held = held_at(arm, spring_m), arm.held
-    assert held is not None
+    assert held is not None  # the steps see to it
     effect, predicted = at.effect_kpa_per_kg, residual(held, spring_m, at.pressure_kpa)
     left_kpa = pressure_kpa - at.pressure_kpa - predicted.mean_kpa.reshape(effect.shape)
     payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
@@ -179,7 +179,7 @@ def fit_payload_scale(arm: CalibratedArm, poses: StaticPoses, rows: np.ndarray) 
         rows (k,): indices of `MIN_WEIGHED` poses or more with weights of `LEAST_WEIGHT` or more.
     """
     spec, held = arm.spec, arm.held
-    assert held is not None
+    assert held is not None  # the steps see to it
     # Estimate the weights from the pressures that remain
     weight_kg, spring_m = poses.payload_kg[rows] - spec.mass.payload_kg, poses.spring_m[rows]
     kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)

@@ -385,7 +385,7 @@ def _histogram(x_label: str, errors_mm: Mapping[str, np.ndarray]) -> Figure:
     bins = np.linspace(0.0, np.nanquantile(np.concatenate([*errors_mm.values()]), 0.99), _BINS).tolist()
     for label, values in errors_mm.items():
         axes.hist(values, bins, density=True, alpha=0.5, label=label)
-    axes.set(xlabel=x_label, ylabel="density")
+    axes.set(xlabel=f"{x_label}; 1 % are larger", ylabel="density")
     axes.legend(fontsize="small", loc="upper left")
     axes.grid(alpha=0.3)
     return figure

@@ -97,16 +97,16 @@ def _expectations(hint: Any) -> Iterator[tuple[Callable[[Any], bool], str]]:
             yield from _expectations(part)
 
 
-def anything(default: Any = dataclasses.MISSING, **rule: Any) -> Any:
-    """Declare a field with the arguments of its `Rule`: without any, a number."""
+def anything(*, default: Any = dataclasses.MISSING, **rule: Any) -> Any:
+    """Declare a field with the arguments of its `Rule`; by default any number."""
     return field(default=default, metadata={"rule": Rule(**rule)})
 
 
 positive = functools.partial(anything, low=0.0, low_open=True)
 not_negative = functools.partial(anything, low=0.0)
 count = functools.partial(anything, kind=int, low=1, high=MAX_COUNT)
-vector = functools.partial(anything, (0.0, 0.0, 0.0), length=3)
-numbers = functools.partial(anything, (), length=0)  # one for each part; empty means zeros
+vector = functools.partial(anything, default=(0.0, 0.0, 0.0), length=3)
+numbers = functools.partial(anything, default=(), length=0)  # one for each part; empty means zeros
 
 
 def scaled(value: PerSection, factor: float) -> PerSection:
@@ -154,20 +154,20 @@ def read_fields(cls: type, data: Any, where: str) -> dict[str, Any]:
     return values
 
 
-def check_counts(table: Any, counts: dict[str, int], where: str) -> None:
-    """Raise SpecError for a list whose length is not the number of the arm's parts that it describes.
+def wrong_counts(table: Any, counts: dict[str, int], where: str = "") -> Iterator[str]:
+    """Yield what is wrong about lists whose length is not the number of the arm's parts that they describe.
 
-    `counts` are by the names that rules have for parts; `where` is that of `read_fields`.
+    `counts` are by the names that rules have for parts; `where` is the path of the table.
     """
     for item in fields(table):
         value, rule = getattr(table, item.name), rule_of(item)
         if dataclasses.is_dataclass(value):
-            check_counts(value, counts, f"{where}{item.name}.")
+            yield from wrong_counts(value, counts, f"{where}{item.name}.")
             continue
         is_list = rule.per and isinstance(value, tuple) and value != item.default
         if is_list and len(value) != (n := counts[rule.per]):
             expected = f"{'one, or ' if rule.length is None else ''}one for each of the {n} {rule.per}"
-            raise SpecError(f"{where}{item.name}: got {len(value)} numbers, expected {expected}")
+            yield f"{where}{item.name}: got {len(value)} numbers, expected {expected}"
 
 
 def rule_of(item: dataclasses.Field) -> Rule:

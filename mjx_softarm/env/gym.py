@@ -58,7 +58,7 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         config: EnvConfig | None = None,
     ):
         self.num_envs = num_envs
-        self.env = ReachEnv(arm, config)
+        self.env = _reach_env(arm or ArmSpec.default(), config or EnvConfig())
         self.single_observation_space, self.single_action_space = spaces(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -110,7 +110,7 @@ class SoftArmEnv(gymnasium.Env):
     """One arm, by default the paper's, that reaches for poses; `gymnasium.make` adds a time limit."""
 
     def __init__(self, arm: ArmSpec | None = None, config: EnvConfig | None = None):
-        self.env, self._reset_arm, self._step_arm = _compiled(arm, config)
+        self.env, self._reset_arm, self._step_arm = _compiled(arm or ArmSpec.default(), config or EnvConfig())
         self.observation_space, self.action_space = spaces(self.env)
         self._state: State | None = None
 
@@ -195,10 +195,13 @@ def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     return gymnasium.spaces.Box(least, greatest), actions
 
 
+_reach_env = functools.lru_cache(maxsize=8)(ReachEnv)  # its poses are settled once for equal arms
+
+
 @functools.lru_cache(maxsize=8)
-def _compiled(arm: ArmSpec | None, config: EnvConfig | None) -> tuple[ReachEnv, Callable, Callable]:
+def _compiled(arm: ArmSpec, config: EnvConfig) -> tuple[ReachEnv, Callable, Callable]:
     """Return an environment, its reset and its step, compiled once for all that share arm and config."""
-    env = ReachEnv(arm, config)
+    env = _reach_env(arm, config)
     return env, xla.jit(env.reset), xla.jit(env.step)
 
 

@@ -206,18 +206,18 @@ class ReachEnv(brax_envs.Env):
             moving = draws.uniform(jax.random.fold_in(rng, 1), moving.shape)
         return jnp.concatenate([draws.uniform(rng, (n, 3 + self.spec.n_chambers)), moving], axis=1)
 
-    def reset_from(self, share: Array) -> State:
+    def reset_from(self, noise: Array) -> State:
         """Start the episode that a row of `sample_noise` fixes."""
         # Start and goal, and the arm of this episode
-        start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
+        start_row, goal_row = (self.config.n_poses * noise[:2]).astype(jnp.int32)
         pool = self.pool
         start = jax.tree.map(lambda x: x[start_row], pool)
         goal = pool.pose[goal_row]
         spread = self.config.randomisation
-        stiffness, moving = jnp.split(share[3:], [self.spec.n_chambers])
+        stiffness, moving = jnp.split(noise[3:], [self.spec.n_chambers])
         factor = 1.0 + spread.stiffness_spread * (2.0 * stiffness - 1.0)
         arm = ArmState(
-            payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],
+            payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * noise[PAYLOAD_SHARE],
             chamber_stiffness=self.params.stiffened(factor).chamber_stiffness,
             moving=motion_params(self.actuators, spread, moving),
             motion=self._resting(start),
@@ -248,7 +248,7 @@ class ReachEnv(brax_envs.Env):
         if not self.config.in_motion:
             return Motion.at_rest(*equilibrium)
         spread, actuators = self.config.randomisation, self.spec.actuators
-        factor = 1.0 + spread.regulator_spread * isinstance(actuators, Regulator)
+        factor = 1.0 + spread.regulator_spread if isinstance(actuators, Regulator) else 1.0
         longest_s = factor * float(np.max(actuators.delay_s)) + spread.delay_max_s  # of all episodes
         n_waiting = n_earlier(longest_s, 1.0 / self.spec.control.rate_hz)
         return Motion.at_rest(*equilibrium, n_waiting, self.actuators.rest_offset_kpa)

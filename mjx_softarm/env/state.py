@@ -49,7 +49,8 @@ class State(brax_envs.State):
 
 def nominal_share(actuators: Actuators) -> Array:
     """Return the `share` of `motion_params` that gives the nominal parameters."""
-    return jnp.array([0.5, 0.0, 0.0] + [0.5] * 3 * isinstance(actuators, Regulator))
+    regulated = [0.5] * 3 if isinstance(actuators, Regulator) else []
+    return jnp.array([0.5, 0.0, 0.0, *regulated])
 
 
 def motion_params(actuators: Actuators, spread: Randomisation, share: Array) -> MotionParams:

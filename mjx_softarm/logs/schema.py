@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm._support.files import replacing
+from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.sensing.sensors import SENSORS, Coil, Sensor
 
 # Kind of quantity -> units of a file, each with its factor to the internal unit, which comes first.
@@ -116,8 +117,17 @@ class Log:
         return {name: value for name in GROUPS if (value := getattr(self, name)) is not None}
 
     def lengths_m(self, sensor: Sensor) -> np.ndarray | None:
-        """Return the spring lengths (n, n_springs) [m]: by the readings, NaN where one is not believed."""
-        return self.spring_m if self.readings is None else sensor.lengths(self.readings, np.nan).length_m
+        """Return the spring lengths (n, n_springs) [m]: by the readings, NaN where one is not believed.
+
+        Raises:
+            LogError: the readings are of another kind of sensor.
+        """
+        if self.readings is None:
+            return self.spring_m
+        if self.reading_name != sensor.reading_name:
+            problem = f"got readings of another sensor, expected {sensor.reading_name} of a {sensor.kind}"
+            raise LogError([Finding(self.source, None, f"{self.reading_name}0", problem)])
+        return sensor.lengths(self.readings, np.nan).length_m
 
     def take(self, rows: np.ndarray) -> Log:
         """Return a log of some rows, given by indices or a mask (n,)."""

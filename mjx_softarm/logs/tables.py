@@ -63,7 +63,7 @@ def _read_npz(path: Path) -> Table:
 
 def _read_csv(path: Path) -> Table:
     # Header: the first line names the columns.
-    first, *lines = _text(path).splitlines()
+    first, *lines = _text(path).replace("\r\n", "\n").replace("\r", "\n").split("\n")
     names = tuple(name.strip() for name in first.split(","))
     if "," not in first:
         delimiters = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
@@ -77,6 +77,7 @@ def _read_csv(path: Path) -> Table:
         cells = line.split(",")
         if len(cells) != len(names):
             hint = " (decimal commas?)" if len(cells) >= 1.5 * len(names) else ""
+            hint = next((f" and {text}" for mark, text in _OTHER_DELIMITERS.items() if mark in line), hint)
             problem = f"got {len(cells)} cells{hint}, expected {len(names)} as in the header"
             raise _error(path, problem, number)
         numbers = np.full(len(cells), np.nan)

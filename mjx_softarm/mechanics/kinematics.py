@@ -44,7 +44,8 @@ class Frames(NamedTuple):
 def chain_kinematics(params: ArmParams) -> Callable[[Array], Frames]:
     """Return the closed form of an arm: a function from joint coordinates (nv, *arms) to its frames.
 
-    It multiplies the links' rotations and adds the links' vectors.
+    It multiplies the links' rotations and adds the links' vectors. With arms, each number of `params` has
+    the axes of the arms at its end, too.
     """
     return functools.partial(_chain_frames, params.link_length_m, params.mount)
 

@@ -192,7 +192,7 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises:
         SealedFileError: the file is no policy of this version, is damaged, or has a wrong entry.
-        SpecError: the arm in it is none.
+        SpecError: the specification of its arm is not valid.
     """
     return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
 
@@ -229,6 +229,12 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
+def _take_reward(entries: Entries) -> RewardConfig:
+    names = [item.name for item in dataclasses.fields(RewardConfig) if item.name != "axes"]
+    numbers = {name: entries.take(f"reward.{name}", np.float64, ()) for name in names}
+    return RewardConfig(**numbers, axes=tuple(entries.take("reward.axes", np.float64, (6,)).tolist()))
+
+
 def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadEstimator, SpringModel]:
     """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries."""
     n_sections = spec.structure.n_sections
@@ -255,12 +261,11 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     entries.names("obs_layout", obs_layout)
     entries.names("action_layout", action_layout(spec))
     s2r_kind = entries.one_of("s2r_kind", ("mlp", "none"))
-    reward = entries.group("reward", RewardConfig, (), (6,))
     estimator, load_estimator, spring_model = take_networks(entries, spec)
     policy = Policy(
         layers=entries.layers("actor", len(obs_layout), n),
         obs_scale=entries.group("obs_scale", ObsScale, (6,)),
-        reward=dataclasses.replace(reward, axes=tuple(reward.axes.tolist())),
+        reward=_take_reward(entries),
         actions=ActionMap(
             entries.group("sensor", type(spec.sensor), (), (n,)),
             *(entries.take(f"action.{name}", np.float64, (n,)) for name in ("low", "high")),

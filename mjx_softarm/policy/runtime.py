@@ -126,8 +126,10 @@ class PolicyRunner:
         n_more = len(self.policy.obs_layout) - OBS_SIZE
         entries = np.asarray([] if sensed is None else sensed, np.float32)
         if entries.shape[-1:] != (n_more,):
-            expected = f"(..., {n_more}): the policy observes the {self.policy.observation}"
-            raise ValueError(f"sensed: got shape {entries.shape}, expected {expected}")
+            came = "None" if sensed is None else f"shape {entries.shape}"
+            expected = f"(..., {n_more})" if n_more else "None"
+            kind = self.policy.observation
+            raise ValueError(f"sensed: got {came}, expected {expected}: the policy observes the {kind}")
         entries = np.broadcast_to(entries, (*pose.shape[:-1], n_more))
         action = action_towards(self.policy, pose, goal, entries)
         if not np.isfinite(action).all():

@@ -11,7 +11,7 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.control import YIELD_M_PER_KPA
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.settle import settle
+from mjx_softarm.mechanics.settle import settle, settle_pressures
 from mjx_softarm.mechanics.statics import statics
 from tests.arms import FOUR_CHAMBERS, SHORT, SIX_CHAMBERS, TAPERED
 
@@ -118,6 +118,17 @@ def test_the_derivative_is_that_of_finite_differences_at_the_same_active_set(arm
     for name in SEEN:
         assert relative_error(slope[name], quotient[name]).max() < 1e-4, name
         assert np.abs(quotient[name]).max() > 1e-2
+
+
+def test_held_pressures_have_the_derivative_of_finite_differences():
+    with jax.enable_x64(True):
+        params = ArmParams.from_spec(SHORT, np.float64)
+        q_of = jax.jit(lambda pressure_kpa: settle_pressures(params, pressure_kpa).q)
+        pressure_kpa, step_kpa = np.random.default_rng(3).uniform(-35.0, 15.0, 3), 0.01
+        slope = jax.jacfwd(q_of)(pressure_kpa)  # (nv, 3)
+        steps = step_kpa * np.eye(3)
+        quotient = [(q_of(pressure_kpa + d) - q_of(pressure_kpa - d)) / (2 * step_kpa) for d in steps]
+        np.testing.assert_allclose(slope.T, quotient, rtol=1e-5, atol=1e-9)
 
 
 def test_reverse_mode_is_the_transpose_of_forward_mode():

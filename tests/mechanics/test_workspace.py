@@ -54,6 +54,7 @@ def test_every_sampled_pose_is_a_rest_of_c_mujoco():
         np.testing.assert_allclose(pool().spring_m[k], spring_lengths(data, 9, 9), atol=1e-6)
     assert pool().spring_m.min() > SPEC.springs.length_min_m - 1e-3
     assert pool().spring_m.max() < SPEC.springs.length_max_m + 1e-3
+    assert ((pool().pressure_kpa >= LOW_KPA) & (pool().pressure_kpa <= HIGH_KPA)).all()
 
 
 def test_even_poses_fill_more_of_the_volume_and_its_rim_than_those_of_the_training():

@@ -159,6 +159,8 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ("provenance_json", "[1]", "provenance_json: got '[1]', expected a JSON object"),
         ("spec_json", '{"nose": 1}', "spec_json: nose: got an unknown field, expected name, "),
         ("rate_hz", [{}], "got a damaged array ("),
+        ("reward.threshold", np.full(6, 0.03), "reward.threshold: got float64 (6,), expected "),
+        ("reward.axes", 1.0, "reward.axes: got float64 (), expected "),
     ],
 )
 def test_entries_that_do_not_fit(file, entry, value, message):

@@ -124,9 +124,9 @@ def test_malformed_pose_or_goal_is_refused(runner, name, value, message):
 @pytest.mark.parametrize(
     ("observation", "n_more", "sensed", "message"),
     [
-        ("pose", 0, [0.5], r"got shape \(1,\), expected \(..., 0\): the policy observes the pose"),
-        ("payload", 1, None, r"got shape \(0,\), expected .* the policy observes the payload"),
-        ("motion", 39, None, r"got shape \(0,\), expected .* the policy observes the motion"),
+        ("pose", 0, [0.5], r"got shape \(1,\), expected None: the policy observes the pose"),
+        ("payload", 1, None, r"got None, expected .* the policy observes the payload"),
+        ("motion", 39, None, r"got None, expected .* the policy observes the motion"),
     ],
 )
 def test_what_is_sensed_must_be_what_the_policy_observes(runner, observation, n_more, sensed, message):

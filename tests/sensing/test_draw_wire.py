@@ -73,6 +73,8 @@ def test_recorded_voltages_calibrate_the_wires(tmp_path):
     np.testing.assert_allclose(fit.offset, DELTA_M, atol=1e-3)
     with pytest.raises(LogError, match="voltage0: got readings of another sensor, expected frequency"):
         read_log(tmp_path / "springs.csv")
+    with pytest.raises(LogError, match="voltage0: got readings of another sensor, expected frequency"):
+        log.lengths_m(ArmSpec.default().spring_sensor)
 
 
 def test_policy_is_written_read_and_run(tmp_path):

@@ -296,7 +296,7 @@ def _start(runs: Runs, used: np.ndarray, arm: ArmLag, n_sections: int) -> Regula
     grid = np.array([*itertools.product(VOLUME_SHARES, LAGS_S, DEAD_TIMES_S, rates, rates)])
     share, lag_s, dead_time_s, fill, vent = grid.T[..., None]  # (b, 1) each
     offset_kpa = np.median(np.concatenate([t.pressure_kpa - t.commanded_kpa for t in runs.tracks]), axis=0)
-    starts = Regulator(lag_s, dead_time_s, fill, vent, DEADBAND_KPA, offset_kpa, share)
+    starts = Regulator(lag_s, dead_time_s, fill, vent, DEADBAND_KPA, offset_kpa, volume_share=share)
     errors = runs.errors(runs.simulated(starts), arm.of_modes(np.zeros(2 + n_sections), runs.n_chambers))
     rms = np.array([rms_of(error[used]) for error in errors])
     share, lag_s, dead_time_s, fill, vent = grid[np.argmax(rms <= ALIKE * rms.min())].tolist()

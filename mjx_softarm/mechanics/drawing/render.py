@@ -76,8 +76,10 @@ class Renderer:
         A payload that the model does not draw by itself is a ball of `payload_radius_m` at the finger tips.
 
         Raises:
-            ValueError: q is not finite.
+            ValueError: q has another shape, or is not finite.
         """
+        if np.shape(q) != (self._model.nq,):
+            raise ValueError(f"q: got shape {np.shape(q)}, expected ({self._model.nq},)")
         if not np.isfinite(q).all():
             raise ValueError("q: got numbers that are not finite, expected those of an arm that settled")
 
