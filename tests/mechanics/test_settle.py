@@ -18,6 +18,7 @@ from mjx_softarm.mechanics.settle import (
     settle,
 )
 from mjx_softarm.mechanics.workspace import settle_many
+from tests.arms import OTHER_ARMS
 
 SPEC = ArmSpec.default()
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
@@ -83,10 +84,15 @@ CHANGES = {
 ARMS = {name: SPEC.replace(**changes) for name, changes in CHANGES.items()}
 
 
-@pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_many, pressures)])
-def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
-    spec = ARMS[arm]
+@pytest.mark.parametrize(
+    "solve, targets, arm",
+    [
+        *((settle, references, arm) for arm in ARMS),
+        *((settle_many, pressures, arm) for arm in ARMS | OTHER_ARMS),  # by references: test_fidelity.py
+    ],
+)
+def test_c_mujoco_finds_the_settled_arm_in_balance(solve, targets, arm):
+    spec = (ARMS | OTHER_ARMS)[arm]
     found = settled(solve, targets(spec), spec)
     assert found.settled.all()
     left = imbalance(spec, found)
