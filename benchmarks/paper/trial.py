@@ -118,7 +118,7 @@ def operate(
 
     watch(twin, note)
     # Run the loop, with or without stops.
-    passed = np.char.startswith(names, "to ") & trial.moves | bool(trial.lap_s)
+    passed = (np.char.startswith(names, "to ") & trial.moves) | bool(trial.lap_s)
     passed[[0, -1]] = False
     stops = np.flatnonzero(~passed)
     if trial.moves or trial.lap_s:

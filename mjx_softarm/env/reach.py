@@ -280,24 +280,24 @@ class ReachEnv(brax_envs.Env):
         # Saturation, by the law's integral: in motion a pressure may be at a limit for a moment
         held_kpa = arm.motion.law.integral_kpa
         off = control.saturated(held_kpa, reference_m, arm.spring_m, self.gains, control.TOLERANCE_M)
-        saturated = off & valid
-        blocked = jnp.any(saturated)
+        blocked = off & valid  # (n_chambers,)
+        saturated = jnp.any(blocked)
 
         # Reward
         way = self._way(arm, end, valid)
         cost, config = self.clearance_cost(way["clearance_mm"]), self.config.reward
-        value, reached, terms = rewards.reward(arm.pose, arm.goal, arm.n_steps, blocked, config, cost)
+        value, reached, terms = rewards.reward(arm.pose, arm.goal, arm.n_steps, saturated, config, cost)
 
         metrics = {
             "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
             "reached": reached & valid,
-            "saturated_chambers": jnp.sum(saturated),
+            "saturated_chambers": jnp.sum(blocked),
             "unsettled": ~valid,
             **{name: result == code for name, code in self._failures.items()},
             **{f"reward_{name}": jnp.where(valid, term, 0.0) for name, term in terms.items()},
         }
         metrics = {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
-        info = {"saturated": blocked, "blocked": saturated, "valid": valid, **way}
+        info = {"saturated": saturated, "blocked": blocked, "valid": valid, **way}
         return state.replace(
             pipeline_state=arm,
             obs=self.observe(arm.pose, arm.goal, arm.sensed),

@@ -37,7 +37,8 @@ def twin_of(name: str) -> Twin | RodTwin:
     number, spec = _seed_and_arm(rest, "twin:SEED")
     if colon and pipe not in PIPES:
         raise ValueError(
-            f"twin:{rest}:PIPE: got {pipe!r}, expected one of {', '.join(PIPES)}, or grams, 500g"
+            f"twin:{rest}: got {pipe!r}, expected one of {', '.join(PIPES)}, then aged or exact, then a "
+            "lost chamber, lost4, then grams, 500g; each may be left out"
         )
     return Twin(number, spec, payload_kg, build=build, pipe=PIPES[pipe] if pipe else None)
 
