@@ -41,11 +41,11 @@ class Strategy(Protocol):
     """Interface of a strategy: a value with a memory."""
 
     def references(self, belief: Belief, goal: np.ndarray) -> Answer:
-        """Act or wait, towards a goal (6,) [mm, deg], that ahead if it moves."""
+        """Return memory, references and faults towards a goal (6,) [mm, deg], that ahead if it moves."""
         ...
 
 
-# Strategy with its next memory, None once the springs have settled after the last action; references
+# Strategy with its next memory, None where no further action is due; references
 # (n_springs,) [m], None: the last ones stay; faults
 Answer = tuple[Strategy | None, np.ndarray | None, tuple[Event, ...]]
 

@@ -1,4 +1,4 @@
-"""Stop operators against closed forms: area of a loop, return-point memory."""
+"""Stop operators against closed forms: area of a loop, return-point memory, passivity."""
 
 import numpy as np
 import pytest
@@ -28,3 +28,13 @@ def test_hysteresis_remembers_where_it_turned():
     for x in detour:
         around = stops[1].move(np.array([x]))
     np.testing.assert_allclose(around, direct, atol=1e-12)
+
+
+def test_hysteresis_never_gives_more_than_it_took():
+    rng = np.random.default_rng(0)
+    limit = rng.uniform(0.1, 1.0, (5, 3))
+    stops = StopOperators(rng.uniform(10.0, 100.0, (5, 3)), limit, np.zeros(5))
+    step = 0.01 * rng.standard_normal((5000, 5))
+    force = np.array([stops.move(x) for x in np.cumsum(step, axis=0)])
+    assert (np.cumsum(force * step, axis=0) >= 0.0).all()
+    assert (np.abs(force) <= limit.sum(axis=1) + 1e-12).all()

@@ -1,5 +1,8 @@
 """The rod twin behind `ArmIO`."""
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,11 +10,19 @@ from scipy.spatial.transform import Rotation
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.spec import ArmSpec
+from mjx_softarm.twin import rod, rod_twin
 from mjx_softarm.twin.instruments import Build
 from mjx_softarm.twin.rod_twin import RodTwin, draw_regulator
 from tests.twin.conftest import KPA, hold
 
 EXACT = Build(losses=0.0, noise=0.0, per_section=3)  # without deadband and noise
+
+
+@pytest.mark.parametrize("module", [rod, rod_twin])
+def test_it_is_written_without_the_training_model(module):
+    tree = ast.parse(Path(module.__file__).read_text("utf-8"))
+    imported = " ".join(ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom))
+    assert imported and "mechanics" not in imported and "mujoco" not in imported
 
 
 def test_refinement_changes_little():

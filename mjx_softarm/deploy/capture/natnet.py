@@ -25,7 +25,7 @@ COMMAND_PORT = 1510
 DATA_PORT = 1511
 WAIT_S = 2.0  # longest wait for the server's answer, for its descriptions, and for the first frame
 AGAIN_S = 1.0  # time without a frame after which the server is asked again; it may have begun anew
-MOST = 500  # most frames that one poll reads; a socket holds fewer, and a flood does not stop the loop
+MOST = 100  # most frames that one poll reads, in some 6 ms, so that a flood does not hold up the loop
 
 
 class _Enough(Exception):

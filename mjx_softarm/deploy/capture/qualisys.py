@@ -57,7 +57,8 @@ class Qualisys:
             newest = self._packet
             self._packet = None
         if not self._connection.has_transport():
-            raise ConnectionResetError(f"got an end of the connection by {self._name.host}")
+            host = self._name.host
+            raise ConnectionResetError(f"got an end of the connection by {host}, which is not made again")
         return self._frame(newest) if newest is not None else None
 
     def close(self) -> None:
