@@ -23,6 +23,35 @@ MISSED = "--goal=" + ",".join(map(str, GOALS[0]))
 
 
 @pytest.mark.parametrize(
+    ("fault", "status", "message"),
+    [
+        ("raise RuntimeError('valve')", 3, "write_pressures: RuntimeError: valve (driver.py, line "),
+        ("signal.raise_signal(signal.SIGTERM)", 143, "ended early: ended by SIGTERM"),
+        ("signal.raise_signal(signal.SIGINT)", 130, "ended early: interrupted"),
+    ],
+)
+def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, message):
+    """The driver writes each command to a file; the fault comes once, half a second after the start."""
+    driver = (
+        (folder / "driver.py").read_text()
+        + f"""
+        with open("written.txt", "a") as file:
+            print(*pressure_kpa, file=file)
+        if abs(self.time_s - 0.5) < 1e-6:
+            {fault}
+"""
+    )
+    (folder / "driver.py").write_text(
+        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n" + driver
+    )
+    done = command(folder, "record", "--arm", "driver:Arm", "--out", "a.csv", "--poses", "9")
+    assert done.stdout.endswith(f"{status} []\n") and message in done.stderr
+    written = np.loadtxt(folder / "written.txt")
+    assert np.abs(written).max() > 3.0 and not written[-1].any()
+    assert (folder / "a.csv").read_text().count("\n") == 1 + 25
+
+
+@pytest.mark.parametrize(
     ("name", "message"),
     [
         ("twin", "expected twin:SEED, wiring.toml or package.module:Class"),

@@ -185,15 +185,38 @@ class Noisy(Seen):
         return Capture(tip_m, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
 
 
-def test_a_recording_ends_where_more_poses_bring_nothing(monkeypatch):
+@pytest.fixture
+def checked_early(monkeypatch):
     monkeypatch.setattr(recording, "MIN_POSES", 10)
     monkeypatch.setattr(recording, "CHECK_POSES", 5)
+
+
+def test_a_recording_ends_where_more_poses_bring_nothing(checked_early):
     lines = []
     result = record(Noisy(), SPEC, growing(random_pressures(SPEC, 60, 3)), tell=lines.append)
     assert result.n_poses < 60 and result.ending == Ending()
     assert lines[-1] == "half of them predict as well: more poses bring nothing"
     error_mm = float(re.search("from the others to ([0-9.]+) mm", lines[-2])[1])
     assert error_mm == pytest.approx(1540.0, rel=0.4)  # median of the length of three normal numbers
+
+
+class Restless(Seen):
+    """The tip never rests at one set of pressures."""
+
+    def __init__(self, at_kpa):
+        super().__init__()
+        self.at_kpa = at_kpa
+
+    def motion_capture(self):
+        off_m = 0.1 * self._rng.standard_normal(3) if np.array_equal(self.command_kpa, self.at_kpa) else 0.0
+        return Capture(self.spring_m[:3] + off_m, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
+
+
+def test_a_pose_that_never_rests_is_no_second_check(checked_early, monkeypatch):
+    monkeypatch.setattr(recording, "prediction_errors_mm", lambda poses, spec: (1.0, 1.0))
+    targets_kpa = growing(random_pressures(SPEC, 30, 3))
+    result = record(Restless(targets_kpa[10]), SPEC, targets_kpa)
+    assert (result.n_poses, result.n_unsettled) == (15, 1)
 
 
 def test_recording_stops_and_vents_when_readings_are_lost():

@@ -12,8 +12,9 @@ system's axes then, and put their origins in the middle of the last plate and of
 the few millimetres and degrees that remain.
 
 The loop takes the newest frame of each tick and never waits for one. A frame is missed, which is a gap in the
-log, where none is new, it is late, or a body is not seen in it. The base does not move, so it keeps the place
-at which it was last seen. Frames are logged with the tick that takes them, not shifted by their age.
+log, where none is new, it is late, it is the first after a second without any, or a body is not seen in it.
+The base does not move, so it keeps the place at which it was last seen. Frames are logged with the tick that
+takes them, not shifted by their age.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.capture.natnet import NatNet
 from mjx_softarm.deploy.capture.qualisys import Qualisys
-from mjx_softarm.deploy.capture.system import UP, CaptureName
+from mjx_softarm.deploy.capture.system import UP, CaptureFrame, CaptureName
 from mjx_softarm.deploy.link import describe, first_frame
 from mjx_softarm.posture import straight_pose
 from mjx_softarm.sensing.pose import (
@@ -41,8 +42,8 @@ from mjx_softarm.spec import ArmSpec
 
 LATE_S = 0.05  # delay, beyond that of the fastest frames, of a frame that is late; by hand
 DRIFT = 1e-3  # largest difference of the two clocks' rates that is not taken for a delay; by hand
-LOST_S = 1.0  # time without the tip after which it is reported lost; by hand
-ANEW_S = 1.0  # larger delays show that the system's clock has begun anew; by hand
+LOST_S = 1.0  # time without a frame after which motion capture counts as lost; by hand
+MOST_POLLS = 50  # polls that pass over queued frames; they read more than a socket holds; by hand
 # Largest distance of the tip from the end of the straight arm, in its lengths, and largest angle; by hand.
 # Wrong axes are 1.4 lengths and 90 degrees off.
 _NEAR = 0.5
@@ -54,20 +55,20 @@ class Delay:
     """Delay of frames beyond that of the fastest, on two clocks that need not agree."""
 
     def __init__(self) -> None:
-        self._offset_s = np.inf  # between the clocks, with the delay of the fastest frame
+        self._offset_s = np.inf
         self._frame_s = -np.inf
         self._now_s = 0.0
 
     def measure(self, frame_s: float, now_s: float) -> float:
         """Return the delay [s] of a frame with a time [s] on its own clock, taken at a time [s] on ours."""
+        # After a while without frames the system may have begun anew, and its clock with it.
+        if frame_s < self._frame_s or now_s - self._now_s > LOST_S:
+            self._offset_s = np.inf
         drifted_s = self._offset_s + DRIFT * (now_s - self._now_s)
-        delay_s = now_s - frame_s - drifted_s
-        is_fastest = delay_s < 0.0
-        is_anew = frame_s < self._frame_s or delay_s > ANEW_S
-        self._offset_s = now_s - frame_s if is_fastest or is_anew else drifted_s
+        self._offset_s = min(drifted_s, now_s - frame_s)
         self._frame_s = frame_s
         self._now_s = now_s
-        return max(delay_s, 0.0)
+        return now_s - frame_s - self._offset_s
 
 
 class CapturedArm:
@@ -84,6 +85,7 @@ class CapturedArm:
         self._delay = Delay()
         self._seen_s = time.monotonic()
         self._lost = False
+        self._polled_s = -np.inf  # time of the last frame, whatever it shows
         self._base: tuple[np.ndarray, np.ndarray] | None = None if name.base else (np.zeros(3), np.eye(3))
         self._n_asked = 0
         self._delay_s: list[float] = []
@@ -119,9 +121,25 @@ class CapturedArm:
         late = f"; at most {1e3 * max(self._delay_s):.0f} ms later than the fastest" if self._delay_s else ""
         return line + late
 
+    def _newest(self) -> CaptureFrame | None:
+        """Return the newest frame since the last call; None without one, or if it may be an old one."""
+        frame = self._source.poll()
+        now_s = time.monotonic()
+        if frame is None:
+            return None
+        paused = now_s - self._polled_s > LOST_S
+        self._polled_s = now_s
+        if not paused:
+            return frame
+        # Frames have queued up, maybe until the queue was full: all may be old. The next one is new.
+        for _ in range(MOST_POLLS):
+            if self._source.poll() is None:
+                break
+        return None
+
     def _take(self) -> Capture:
         name = self._name
-        frame = self._source.poll()
+        frame = self._newest()
         if frame is None:
             raise TimeoutError(f"got no new frame from {name.host}")
         delay_s = self._delay.measure(frame.time_s, time.monotonic())

@@ -25,11 +25,11 @@ COMMAND_PORT = 1510
 DATA_PORT = 1511
 WAIT_S = 2.0  # longest wait for the server's answer, for its descriptions, and for the first frame
 AGAIN_S = 1.0  # time without a frame after which the server is asked again; it may have begun anew
-MOST = 100  # most frames that one poll reads, in some 6 ms, so that a flood does not hold up the loop
+MOST = 20  # number of packets that one poll reads at most, so that a flood does not hold up the loop
 
 
 class _Enough(Exception):
-    """Signal that a poll has read the largest number of frames."""
+    """Signal that a poll has read the largest number of packets."""
 
 
 class NatNet:
@@ -49,7 +49,11 @@ class NatNet:
         self._described: Any = None  # None while the server is asked, and its bodies' numbers are not known
         self._asked_s = time.monotonic()
         for multicast in (False, True):
-            self._connect(multicast)
+            self._client = self._connect(multicast)
+            end_s = time.monotonic() + WAIT_S
+            while not (self._described and self._new) and time.monotonic() < end_s:
+                self._read()
+                time.sleep(0.01)
             if self._described and self._new:
                 break
             self._client.shutdown()
@@ -90,27 +94,23 @@ class NatNet:
     def close(self) -> None:
         self._client.shutdown()
 
-    def _connect(self, multicast: bool) -> None:
-        """Connect, and wait for descriptions and a frame; they may not come."""
+    def _connect(self, multicast: bool) -> Any:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect((self._host, COMMAND_PORT))  # sends nothing; shows which of our addresses is used
             local = probe.getsockname()[0]
-        self._client = self._package.NatNetClient(
+        client = self._package.NatNetClient(
             self._host, local, command_port=COMMAND_PORT, data_port=DATA_PORT, use_multicast=multicast
         )
-        self._client.on_data_frame_received_event.handlers.append(self._on_frame)
-        self._client.on_data_description_received_event.handlers.append(self._on_descriptions)
+        client.on_data_frame_received_event.handlers.append(self._on_frame)
+        client.on_data_description_received_event.handlers.append(self._on_descriptions)
         try:
-            self._client.connect(WAIT_S)
+            client.connect(WAIT_S)
         except TimeoutError as error:
             raise TimeoutError(f"got no answer from {self._name.host}:{COMMAND_PORT}") from error
         except self._package.NatNetError as error:
             raise OSError(str(error)) from error
-        self._client.request_modeldef()
-        end_s = time.monotonic() + WAIT_S
-        while not (self._described and self._new) and time.monotonic() < end_s:
-            self._read()
-            time.sleep(0.01)
+        client.request_modeldef()
+        return client
 
     def _read(self) -> None:
         """Read the packets that have come."""

@@ -1,4 +1,4 @@
-"""Motion capture systems: the option that names one, its frames, and a check of names."""
+"""Motion capture systems: the option that names one, its frames, and checks of names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from mjx_softarm._support.errors import InputError
 # From the system's axes to ours, whose z points up.
 UP = {"y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), "z": np.eye(3)}
 _DEFAULT_UP = {"natnet": "y", "qualisys": "z"}
-_OPTION = re.compile(r"(natnet|qualisys):([^:,]+):([^,]+)((?:,(?:base|markers|up)=[^,]+)*)")
 
 
 class CaptureFrame(NamedTuple):
@@ -43,12 +42,13 @@ class CaptureName(NamedTuple):
     @classmethod
     def read(cls, text: str) -> CaptureName:
         """Read the option's text; InputError if it is malformed."""
-        match = _OPTION.fullmatch(text)
-        if match is None:
+        words, *options = text.split(",")
+        system, host, body, *_ = *words.split(":", 2), "", ""
+        named = {key: value for key, _, value in (option.partition("=") for option in options)}
+        named_well = named.keys() <= {"base", "markers", "up"} and all(named.values())
+        if system not in _DEFAULT_UP or not host or not body or not named_well:
             expected = "natnet:HOST:BODY or qualisys:HOST:BODY, maybe with ,base=BODY,markers=NAME,up=y|z"
             raise InputError(f"--capture: got {text!r}, expected {expected}")
-        system, host, body, options = match.groups()
-        named = dict(option.split("=", 1) for option in options.split(",")[1:])
         name = cls(system, host, body, **{"up": _DEFAULT_UP[system]} | named)
         if name.up not in UP:
             raise InputError(f"--capture: got up={name.up}, expected y or z")
@@ -59,3 +59,13 @@ def check_names(where: str, kind: str, asked: str, known: list[str]) -> None:
     """Refuse a body or a marker set, by an InputError, that the system does not have."""
     if asked and asked not in known:
         raise InputError(f"{where}: got no {kind} {asked!r}, expected one of {', '.join(known) or 'some'}")
+
+
+def numbered(prefix: str, labels: list[str]) -> list[int]:
+    """Return the places of the labels PREFIX0, PREFIX1, ..., in the order of their numbers."""
+    places = {
+        int(label[len(prefix) :]): k
+        for k, label in enumerate(labels)
+        if re.fullmatch(re.escape(prefix) + r"\d+", label)
+    }
+    return [places[number] for number in sorted(places)]

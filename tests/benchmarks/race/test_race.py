@@ -2,12 +2,13 @@
 
 import sys
 
+import numpy as np
 import pytest
 
 from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import Worker
 from benchmarks.race import race
-from benchmarks.race.contestants import CONTESTANTS, settings_of
+from benchmarks.race.contestants import CONTESTANTS, Contestant, prepare, settings_of
 from benchmarks.race.race import PeerTarget, RaceLimits, crossing, judge, limits_of, run, train
 from mjx_softarm._support.errors import InputError
 from train.presets import PRESETS
@@ -39,6 +40,34 @@ def test_a_contestant_trains_until_its_limit_its_target_or_its_end(tmp_path, mon
     result = train(Worker("fake", ["fake_contestant"]), limits)
     assert [point["updates"] for point in result["points"]] == list(range(1, n_points + 1))
     assert result["start_up_s"] == 3.0 and "ended" not in result["points"][-1]
+
+
+def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkeypatch):
+    clock, steps = [0.0], [0]
+
+    class Slow:
+        def __init__(self, n_goals):
+            clock[0] += 1000
+
+        def tip_error_mm(self, policy):
+            clock[0] += 100
+            return np.array([1.0, 2.0, 9.0])
+
+    def stretch():
+        clock[0] += 2.0
+        steps[0] += 10
+
+    monkeypatch.setattr("benchmarks.race.contestants.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("benchmarks.race.contestants.HeldOut", Slow)
+    monkeypatch.setattr("benchmarks.race.contestants.START", -5.0)
+    contestant = Contestant(stretch, lambda obs: obs, lambda: (steps[0], 7), limit=60)
+    monkeypatch.setattr("benchmarks.race.contestants.ours", lambda name, seed: contestant)
+    facts, work = prepare("ours-quick", "0", "3", "8")
+    assert facts == {"start_up_s": 5.0}
+    expected = {"wall_s": 9.0, "trained_s": 4.0, "env_steps": 20, "updates": 7, "median_mm": 2.0}
+    assert work() == expected | {"ended": False}
+    clock[0] += 1000  # nor while nobody asks
+    assert (work()["wall_s"], work()["ended"]) == (13.0, True)
 
 
 def test_the_learning_rate_of_peers_falls_as_that_of_quick():

@@ -1,6 +1,5 @@
 """The arm as a motion capture system sees it, and ways to look at it."""
 
-import contextlib
 import re
 import time
 
@@ -38,20 +37,25 @@ def scene_of(pose=POSE, base=True, up="z", hidden=1):
 
 def look(arm, tries=200):
     """Return the next frame that is not missed."""
+    seen = set()
     for _ in range(tries):
-        with contextlib.suppress(OSError):
+        try:
             return arm.motion_capture()
-        time.sleep(0.005)
-    raise AssertionError("no frame came")
+        except OSError as error:
+            seen.add(str(error))
+            time.sleep(0.005)
+    raise AssertionError(f"no frame came: {seen}")
 
 
 def missed(arm, message, tries=200):
     """Wait for a frame that is missed for this reason."""
+    seen = []
     for _ in range(tries):
         try:
             arm.motion_capture()
         except OSError as error:
-            if re.search(message, str(error)):
+            seen.append(str(error))
+            if re.search(message, seen[-1]):
                 return
         time.sleep(0.005)
-    raise AssertionError(message)
+    raise AssertionError({*seen})

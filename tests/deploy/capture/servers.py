@@ -4,7 +4,6 @@ NatNet: `PacketClient.cpp` and the packet's description of OptiTrack's NatNet SD
 Server Protocol Documentation", version 1.25. Both are written without the packages under test.
 """
 
-import contextlib
 import socket
 import struct
 import threading
@@ -76,9 +75,9 @@ class NatNetServer(Server):
     CLOCK = 1e7  # ticks of the server's clock a second
     LATENCY_S = 0.004
 
-    def __init__(self, scene, group=None):
+    def __init__(self, scene, version=(3, 1), group=None):
         super().__init__(scene)
-        self.group = group
+        self.version, self.group = version, group
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self.socket.settimeout(0.0)
@@ -103,11 +102,17 @@ class NatNetServer(Server):
             asked = struct.unpack("<H", data[:2])[0]
             if asked == 0:  # connect
                 self.clients.add(client)
-                info = b"Motive".ljust(256, b"\0") + bytes([3, 1, 0, 0]) + bytes([3, 1, 0, 0])
+                info = b"Motive".ljust(256, b"\0") + bytes([3, 1, 0, 0]) + bytes([*self.version, 0, 0])
                 info += struct.pack("<QHB4s", int(self.CLOCK), 1511, bool(self.group), b"\xef\xff\x2a\x63")
                 self.socket.sendto(message(1, info), client)
             elif asked == 4:  # model definitions
                 self.socket.sendto(message(5, self.described()), client)
+
+    def sized(self, data):
+        return (struct.pack("<i", len(data)) if self.version >= (4, 1) else b"") + data
+
+    def many(self, items):
+        return struct.pack("<i", len(items)) + self.sized(b"".join(items))
 
     def described(self):
         names = b"".join(b"m%d\0" % k for k in range(len(self.scene.markers)))
@@ -116,8 +121,11 @@ class NatNetServer(Server):
             if name in self.scene.unnamed:
                 continue
             body = name.encode() + b"\0" + struct.pack("<ii3f", number, -1, 0.0, 0.0, 0.0)
-            sets.append((1, body + struct.pack("<i3fi", 1, 0.01, 0.0, 0.0, 0)))  # a marker and its label
-        return many([struct.pack("<i", kind) + data for kind, data in sets])
+            body += struct.pack("<i3fi", 1, 0.01, 0.0, 0.0, 0)  # one marker of its own, and its label
+            sets.append((1, body + (b"m\0" if self.version >= (4, 0) else b"")))
+        return struct.pack("<i", len(sets)) + b"".join(
+            struct.pack("<i", kind) + self.sized(data) for kind, data in sets
+        )
 
     def frame(self, number, time_s):
         scene, exposed = self.scene, int(self.CLOCK * time_s)
@@ -130,16 +138,13 @@ class NatNetServer(Server):
         sets = [b"arm\0" + struct.pack("<i", len(markers)) + markers.astype("<f4").tobytes()]
         sets.append(b"all\0" + struct.pack("<i3f", 1, 9.0, 9.0, 9.0))
         labelled = [struct.pack("<i4fhf", 1, 9.0, 9.0, 9.0, 0.01, 0, 1e-4)]
-        data = struct.pack("<i", number) + many(sets) + many([struct.pack("<3f", 8.0, 8.0, 8.0)])
-        data += many(bodies) + many([])  # skeletons
-        data += many(labelled) + many([]) + many([])  # force plates, devices
+        data = struct.pack("<i", number) + self.many(sets) + self.many([struct.pack("<3f", 8.0, 8.0, 8.0)])
+        data += self.many(bodies) + self.many([])  # skeletons
+        data += self.many([]) if self.version >= (4, 1) else b""  # assets
+        data += self.many(labelled) + self.many([]) + self.many([])  # force plates, devices
         sent = exposed + int(self.CLOCK * self.LATENCY_S)
         data += struct.pack("<IIdQQQh", 0, 0, time_s, exposed, exposed, sent, 0)
-        return message(7, data + bytes(4))
-
-
-def many(items):
-    return struct.pack("<i", len(items)) + b"".join(items)
+        return message(7, data + (bytes(8) if self.version >= (4, 1) else b"") + bytes(4))
 
 
 def message(kind, data):
@@ -149,56 +154,69 @@ def message(kind, data):
 class QualisysServer(Server):
     """QTM: TCP, little-endian, millimetres, matrices column by column, NaN for what is not seen."""
 
-    def __init__(self, scene):
+    def __init__(self, scene, port=0):
         super().__init__(scene)
-        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.listener = socket.create_server(("127.0.0.1", port))
         self.listener.settimeout(0.01)
         self.port, self.client, self.streams = self.listener.getsockname()[1], None, False
+        self.n_accepted, self.n_dropped, self.refuses = 0, 0, ""
 
     def serve(self):
         with self.listener:
             for frames in self.frames():
-                try:
-                    if self.client is None:
-                        self.accept()
-                    else:
-                        self.answer()
-                    for frame in frames if self.streams else ():
-                        self.send(3, frame)
-                except ConnectionError:
-                    self.drop()
+                if self.client is None:
+                    self.accept()
+                else:
+                    self.answer()
+                for frame in frames if self.streams else ():
+                    self.send(3, frame)
         if self.client is not None:
+            self.client.close()
+
+    def accept(self):
+        try:
+            self.client = self.listener.accept()[0]
+        except TimeoutError:
+            return
+        self.n_accepted += 1
+        self.client.settimeout(1.0)
+        self.send(1, b"QTM RT Interface connected\0")
+
+    def send(self, kind, data):
+        if self.client is None:
+            return
+        packet = struct.pack("<II", 8 + len(data), kind) + data
+        try:  # in two parts, as they may come over a network
+            self.client.sendall(packet[:11])
+            self.client.sendall(packet[11:])
+        except OSError:
             self.drop()
 
     def drop(self):
         self.client.close()
-        self.client, self.streams = None, False
-
-    def accept(self):
-        with contextlib.suppress(TimeoutError):
-            self.client = self.listener.accept()[0]
-            self.send(1, b"QTM RT Interface connected\0")
-
-    def send(self, kind, data):
-        packet = struct.pack("<II", 8 + len(data), kind) + data
-        self.client.settimeout(1.0)
-        self.client.sendall(packet[:11])  # in two parts, as they may come over a network
-        self.client.sendall(packet[11:])
+        self.client, self.streams, self.n_dropped = None, False, self.n_dropped + 1
 
     def answer(self):
-        self.client.settimeout(0.0)
-        data = b""
-        with contextlib.suppress(BlockingIOError):
+        self.client.setblocking(False)
+        try:
             data = self.client.recv(4096)
-            if not data:
-                raise ConnectionResetError
+        except BlockingIOError:
+            return
+        except ConnectionResetError:
+            data = b""
+        finally:
+            self.client.settimeout(1.0)
+        if not data:
+            self.drop()
         while data:
             size, _ = struct.unpack("<II", data[:8])
             self.command(data[8:size].rstrip(b"\0").decode().lower())
             data = data[size:]
 
     def command(self, text):
-        if text.startswith("version"):
+        if self.refuses and text.startswith(self.refuses):
+            self.send(0, b"Parse error\0")
+        elif text.startswith("version"):
             self.send(1, b"Version set to " + text.split()[1].encode() + b"\0")
         elif text.startswith("getparameters"):
             bodies = "".join(f"<Body><Name>{name}</Name></Body>" for name in self.scene.bodies)

@@ -9,20 +9,15 @@ import pytest
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy import capture
 from tests.deploy.capture.scene import POSE, SYSTEMS, look, missed, scene_of
+from tests.deploy.capture.servers import QualisysServer
 
 
-@pytest.fixture(params=SYSTEMS)
-def watched(request, serve, opened):
-    """A system's scene, the arm in it, which was seen, and lines that it tells."""
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_lost_body_is_a_gap_that_is_told(system, serve, opened, monkeypatch):
     scene = scene_of()
-    serve(request.param, scene)
-    arm, lines = opened(f"{request.param}:127.0.0.1:tip,base=base,up=z")
+    serve(system, scene)
+    arm, lines = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
     look(arm)
-    return scene, arm, lines
-
-
-def test_a_lost_body_is_a_gap_that_is_told(watched, monkeypatch):
-    scene, arm, lines = watched
     scene.hidden = {"base"}  # which does not move
     for _ in range(10):
         np.testing.assert_allclose(1e3 * look(arm).tip_m, POSE[:3], atol=1e-2)
@@ -39,8 +34,12 @@ def test_a_lost_body_is_a_gap_that_is_told(watched, monkeypatch):
     assert re.search(r"the tip was seen in \d+ of \d+ ticks; at most \d+ ms later", arm.finish())
 
 
-def test_late_frames_are_missed(watched):
-    scene, arm, _ = watched
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_late_frames_are_missed(system, serve, opened):
+    scene = scene_of()
+    serve(system, scene)
+    arm, _ = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
+    look(arm)
     scene.held = True  # frames are made but not sent
     missed(arm, "got no new frame from 127.0.0.1")
     time.sleep(0.1)
@@ -53,25 +52,25 @@ def test_late_frames_are_missed(watched):
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
-def test_a_server_that_goes_does_not_hold_up_the_loop_and_motive_may_come_back(
-    system, serve, opened, monkeypatch
-):
-    monkeypatch.setattr("mjx_softarm.deploy.capture.natnet.AGAIN_S", 0.05)
+def test_a_server_that_goes_does_not_hold_up_the_loop_and_may_come_back(system, serve, opened, monkeypatch):
+    monkeypatch.setattr(f"mjx_softarm.deploy.capture.{system}.AGAIN_S", 0.05)
+    monkeypatch.setattr(capture, "LOST_S", 0.05)
     server = serve(system, scene_of())
     arm, _ = opened(f"{system}:127.0.0.1:tip,base=base,up=z")
     look(arm)
     server.__exit__()
-    missed(arm, "got no new frame" if system == "natnet" else "got an end of the connection by 127.0.0.1")
+    missed(arm, "got no new frame" if system == "natnet" else "got an end of the connection")
     begin_s = time.monotonic()
     for _ in range(100):
         with pytest.raises(OSError):
             arm.motion_capture()
     assert time.monotonic() - begin_s < 100 * 0.02
+    scene = scene_of()
+    scene.bodies = dict(reversed(scene.bodies.items()))  # they have other numbers now
+    again = serve(system, scene, **({"port": server.port} if system == "qualisys" else {}))
     if system == "natnet":  # the same port is asked
-        scene = scene_of()
-        scene.bodies = dict(reversed(scene.bodies.items()))  # they have other numbers now
-        arm._source._client._NatNetClient__command_port = serve(system, scene).port
-        np.testing.assert_allclose(1e3 * look(arm, 1000).tip_m, POSE[:3], atol=1e-2)
+        arm._source._client._NatNetClient__command_port = again.port
+    np.testing.assert_allclose(1e3 * look(arm, 1000).tip_m, POSE[:3], atol=1e-2)
 
 
 def test_a_body_that_the_system_does_not_describe_is_no_base(serve, opened):
@@ -83,17 +82,54 @@ def test_a_body_that_the_system_does_not_describe_is_no_base(serve, opened):
         np.testing.assert_allclose(1e3 * look(arm).tip_m, POSE[:3], atol=1e-2)
 
 
-def test_frames_that_queued_up_are_not_taken_for_new_ones(watched, monkeypatch):
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_frames_that_queued_up_are_not_taken_for_new_ones(system, serve, opened, monkeypatch):
     monkeypatch.setattr("mjx_softarm.deploy.capture.natnet.AGAIN_S", 100.0)
-    scene, arm, _ = watched
-    place_m, axes = scene.bodies["tip"]
-    before_m = look(arm).tip_m
-    for k in (1, 2):
+    monkeypatch.setattr(capture, "LOST_S", 0.2)
+    scene = scene_of(base=False)
+    serve(system, scene)
+    arm, _ = opened(f"{system}:127.0.0.1:tip,up=z")
+    look(arm)
+    for _ in range(2):
         time.sleep(0.5)  # 100 frames
-        scene.bodies["tip"] = place_m + 0.01 * k, axes
+        place_m, axes = scene.bodies["tip"]
+        scene.bodies["tip"] = place_m + 0.01, axes
         time.sleep(0.05)
-        moved_m = np.linalg.norm(look(arm).tip_m - before_m)
-        assert moved_m == pytest.approx(0.01 * k * 3**0.5, abs=1e-5)
+        np.testing.assert_allclose(look(arm).tip_m, place_m + 0.01, atol=1e-5)
+
+
+def test_a_server_that_comes_back_wrong_is_asked_on(serve, opened, monkeypatch):
+    """A connection that is of no use is closed."""
+    monkeypatch.setattr("mjx_softarm.deploy.capture.qualisys.AGAIN_S", 0.05)
+    monkeypatch.setattr(capture, "LOST_S", 0.05)
+    server = serve("qualisys", scene_of())
+    arm, _ = opened("qualisys:localhost:tip,base=base,up=z")
+    look(arm)
+    server.__exit__()
+    again = QualisysServer(scene_of(), port=server.port)
+    bodies = again.scene.bodies
+    with again:
+        for n, wrong, message in (
+            (2, {"refuses": "version"}, "got the answer .*Parse error"),
+            (4, {"bodies": {"base": bodies["base"]}}, "got no body 'tip', expected one of base"),
+        ):
+            again.refuses = wrong.get("refuses", "")
+            again.scene.bodies = wrong.get("bodies", bodies)
+            while again.n_dropped < n:
+                missed(arm, "got an end of the connection by localhost")
+            missed(arm, f"got an end of the connection by localhost.*{message}")
+        assert again.n_accepted - again.n_dropped <= 1
+        again.scene.bodies = bodies
+        np.testing.assert_allclose(1e3 * look(arm, 1000).tip_m, POSE[:3], atol=1e-2)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_body_that_is_not_seen_at_first_is_refused(system, serve, opened):
+    scene = scene_of()
+    scene.hidden = {"tip"}
+    serve(system, scene)
+    with pytest.raises(InputError, match="got .*'tip', expected a frame with the tip within 1 s"):
+        opened(f"{system}:127.0.0.1:tip,base=base,up=z")
 
 
 def test_servers_that_do_not_answer_are_named(serve, opened, monkeypatch):
@@ -108,11 +144,13 @@ def test_servers_that_do_not_answer_are_named(serve, opened, monkeypatch):
             opened(f"{system}:127.0.0.1:tip")
 
 
-def test_packets_that_cannot_be_read_are_gaps(serve, opened):
-    server = serve("natnet", scene_of())
+def test_packets_that_cannot_be_read_are_gaps(serve, opened, monkeypatch):
+    scene = scene_of()
+    server = serve("natnet", scene)
     arm, _ = opened("natnet:127.0.0.1:tip,base=base,up=z")
     whole = server.frame
-    server.frame = lambda *args: whole(*args)[:90]
+    monkeypatch.setattr(server, "frame", lambda *args: whole(*args)[:90])
     missed(arm, "got a packet that cannot be read")
+    monkeypatch.undo()
     server.frame = whole
     look(arm)

@@ -131,6 +131,17 @@ def test_coils_that_cannot_be_read_are_nan_and_leave_the_others(board):
     np.testing.assert_allclose(found[[2, 3, 4, 8]], HZ[[2, 3, 4, 8]], atol=0.6)
 
 
+def test_a_leaking_chamber_shows_in_the_measured_pressures(board):
+    arm, change = board
+    settled(arm, np.full(9, 10.0))
+    change("leak", 3)
+    for _ in range(20):
+        arm.write_pressures(np.full(9, 10.0))
+        arm.read_sensors()
+    off = np.abs(arm.pressures() - 10.0)
+    assert off[3] > 3.0 and np.delete(off, 3).max() < 1.5
+
+
 @pytest.mark.parametrize("count", [9, 4090])
 def test_a_chamber_whose_sensor_s_wire_is_cut_is_closed(count, board):
     arm, change = board
@@ -183,13 +194,13 @@ def test_the_command_writes_the_firmware_of_an_arm(program, tmp_path, capsys):
     assert main(["firmware", "--out", str(tmp_path / "paper")]) == 2
     assert main(["firmware", "--spec", "sopra", "--out", str(tmp_path / "firmware")]) == 0
     made = (tmp_path / "firmware" / "firmware.ino").read_text()
-    for setting in (
-        "int N_SPRINGS = 6",
-        "int N_CHAMBERS = 6",
-        "float MIN_KPA = 0.0f",
-        "float MAX_KPA = 60.0f",
+    for line in (
+        "int N_SPRINGS = 6;",
+        "int N_CHAMBERS = 6;",
+        "float MIN_KPA = 0.0f;",
+        "float MAX_KPA = 60.0f;",
     ):
-        assert f"constexpr {setting};" in made
+        assert f"constexpr {line}" in made
     # Until the pins are those of the arm, the sketch does not compile.
     with pytest.raises(AssertionError, match="FILL_PIN: expected one for each chamber"):
         built(tmp_path, tmp_path / "firmware" / "firmware.ino")
