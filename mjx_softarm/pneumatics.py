@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from mjx_softarm._support.fields import PerChamber, Rule, anything, positive, rule_of
+from mjx_softarm._support.fields import PerChamber, anything, positive, rule_of
 from mjx_softarm._support.xp import Array, array_namespace
 
 ATMOSPHERE_KPA = 101.325
@@ -132,8 +132,8 @@ class Regulator(Actuators):
     fill_kpa_per_s: PerChamber | Array = positive(per="chambers")  # greatest rate of a rising pressure
     vent_kpa_per_s: PerChamber | Array = positive(per="chambers")  # greatest rate of a falling pressure
     deadband_kpa: PerChamber | Array = anything(per="chambers", low=0.0)
-    offset_kpa: PerChamber | Array = field(default=0.0, metadata={"rule": Rule(per="chambers")})
-    volume_share: Array | float = field(default=1.0, metadata={"rule": Rule(low=0.0, high=1.0)})
+    offset_kpa: PerChamber | Array = anything(default=0.0, per="chambers")
+    volume_share: Array | float = anything(default=1.0, low=0.0, high=1.0)
 
     @property
     def delay_s(self) -> Array | float:

@@ -262,9 +262,7 @@ def on_reference(
         arrived_m: largest error of a spring on its reference.
     """
     xp = array_namespace(springs_m, reference_m, pressure_kpa)
-    off_m = xp.mean(springs_m, axis=0) - reference_m
-    if gains.allocation is not None:
-        off_m = allocated_error(-off_m, pressure_kpa, gains.allocation)
+    off_m = allocated_error(reference_m - xp.mean(springs_m, axis=0), pressure_kpa, gains.allocation)
     at_limit = (pressure_kpa <= gains.pressure_min_kpa) | (pressure_kpa >= gains.pressure_max_kpa)
     return xp.all((xp.abs(off_m) < arrived_m) | at_limit)
 

@@ -175,13 +175,11 @@ def extrapolated(belief: Belief) -> tuple[Event, ...]:
 
 def unsettled(belief: Belief) -> tuple[Event, ...]:
     """Return the faults of the springs as they stand before the next action."""
-    off_m = belief.mean_m - belief.command.reference_m
-    kind = "spring"
+    # Not all springs can be on any references where chambers are redundant: errors at the chambers count
     allocation = belief.controller.policy.gains.allocation
-    if allocation is not None:  # not all springs can be on any references: errors at the chambers count
-        off_m = -allocated_error(-off_m, belief.command.pressure_kpa, allocation)
-        kind = "chamber"
-
+    error_m = belief.command.reference_m - belief.mean_m
+    off_m = -allocated_error(error_m, belief.command.pressure_kpa, allocation)
+    kind = "spring" if allocation is None else "chamber"
     events = []
     mask = belief.saturated
     if not belief.settled:

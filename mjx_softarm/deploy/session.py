@@ -160,7 +160,7 @@ class _Session:
         self.arrivals: deque[Arrival] = deque(maxlen=kept)
         self.events: deque[Event] = deque(maxlen=kept)
         self.latency_s: deque[float] = deque(maxlen=kept)
-        self.last: set[Fault] = set()  # faults that were told and last
+        self.last: set[Fault] = set()  # faults that were reported and last
 
     def to_end(self, save: Callable[[Log], None]) -> LoopRun:
         """Run, vent and save the log; return the results."""

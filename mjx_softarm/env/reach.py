@@ -336,6 +336,8 @@ class ReachEnv(brax_envs.Env):
 
     def _clearance_mm(self, q: Array, pose: Array) -> Array:
         """Return the clearance () at joint coordinates (nv,), with the tip at a pose (6,)."""
+        if self.pipe is None:  # spares the tracing of the kinematics
+            return jnp.asarray(jnp.inf, pose.dtype)
         frames = chain_kinematics(self.params)(q)
         return self._body_clearance_mm(frames.plate_position, frames.plate_rotation, pose)
 

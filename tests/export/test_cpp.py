@@ -74,7 +74,7 @@ def test_rows_of_draw_wires_agree(tmp_path):
 
 
 def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):
-    """Of an arm whose sections differ."""
+    """A policy of an arm whose sections differ."""
     policy = carrying_policy(TAPERED)
     golden = agreeing_rows(policy, tmp_path, run_ticks=110)
     (weight, bias), *others = policy.layers

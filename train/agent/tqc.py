@@ -13,7 +13,6 @@ Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K k
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
@@ -62,11 +61,6 @@ class TQCConfig(ReplayConfig):
     initial_alpha: Positive = 1.0  # initial temperature
     target_entropy: Finite | None = None  # target entropy [nat]; None is minus the number of actions
     reward_scale: Positive = 1.0  # factor on every reward in the critics' targets
-
-    def __init_subclass__(cls) -> None:
-        makes_one = {"make_learner", "make_epoch"} & vars(cls).keys()
-        if inspect.get_annotations(cls) and not makes_one:
-            raise TypeError(f"{cls.__name__}: got settings without `make_learner`, expected who reads them")
 
     def __post_init__(self) -> None:
         super().__post_init__()

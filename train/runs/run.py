@@ -134,9 +134,24 @@ def train_together(
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
         InputError: arms in motion diverge, or another process trains in the folder.
     """
+    with sole_trainer(path):
+        state = _train_epochs(job, members, begin, path, console, member)
+        policies = [job.learner.policy(member(state, k).learner) for k in range(len(members))]
+        return [finish(*each, policy) for each, policy in zip(members, policies, strict=True)]
+
+
+def _train_epochs(
+    job: Any,
+    members: Sequence[tuple[Run, Task]],
+    begin: Callable[[], State],
+    path: Path,
+    console: Console,
+    member: Callable[[State, int], State],
+) -> State:
+    """Return the state after the last epoch, with the arguments of `train_together`."""
     (first, shared), learner = members[0], job.learner
     config, n_epochs = first.config, first.config.learner.n_epochs
-    with sole_trainer(path), asked_to_stop() as asked, ExitStack() as stack:
+    with asked_to_stop() as asked, ExitStack() as stack:
         state = begin()
         epoch = int(state.n_epochs)
         for run, _ in members:
@@ -168,8 +183,7 @@ def train_together(
             show(epoch, _line(rows, shared), due)
             if stop and epoch < n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {path}")
-    policies = [learner.policy(member(state, k).learner) for k in range(len(members))]
-    return [finish(*each, policy) for each, policy in zip(members, policies, strict=True)]
+    return state
 
 
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:

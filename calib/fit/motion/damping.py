@@ -28,7 +28,6 @@ from calib.fit.motion.tracks import (
     dense_parts,
     driven_kpa,
     has_commands_alone,
-    spring_lengths_m,
 )
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import PerSection, scaled
@@ -150,7 +149,7 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
         if log.pressure_kpa is None or log.tip_m is None or len(log) < 2:
             continue
         payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
-        spring_m = spring_lengths_m(log, spec)
+        spring_m = log.lengths_m(spec.spring_sensor)
         # Cut the log at gaps, and where the payload changes.
         for rows, times_s, newest in dense_parts(log, 1.0 / spec.control.rate_hz, np.diff(payload) != 0):
             # Resample the part, if it is long enough and its pressures change after the first seconds.

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arm import CalibratedArm
-from calib.fit.motion.tracks import dense_parts, spring_lengths_m
+from calib.fit.motion.tracks import dense_parts
 from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.fields import scaled
 from mjx_softarm.logs.schema import Log
@@ -125,7 +125,7 @@ def _parts(log: Log, arm: CalibratedArm, left: int) -> list[Part]:
     """Return the parts of a log without gaps of time or lengths, a row each `EVERY_S`: the last `left`."""
     # Spring lengths, and the mounting
     spec = arm.spec
-    spring_m, tip_m = spring_lengths_m(log, spec), log.tip_m
+    spring_m, tip_m = log.lengths_m(spec.spring_sensor), log.tip_m
     if tip_m is None or spring_m is None:
         return []
     params = ArmParams.from_spec(spec)

@@ -108,7 +108,7 @@ def find_tracks(
     tracks, left, period_s = [], round(MAX_TOTAL_S * spec.control.rate_hz), 1.0 / spec.control.rate_hz
     for log in logs:
         # What was commanded, and what followed: measured pressures or springs
-        spring_m: Any = spring_lengths_m(log, spec)
+        spring_m: Any = log.lengths_m(spec.spring_sensor)
         commanded_kpa, followed = log.commanded_kpa, log.pressure_kpa
         if resting_kpa is not None:
             commanded_kpa, followed = (log.pressure_kpa if has_commands_alone(log) else None), spring_m
@@ -221,11 +221,6 @@ def _delayed(command_kpa: np.ndarray, before_kpa: np.ndarray, delay: np.ndarray)
         )
         out[:, b, k] = now + part[b, k] * (then - now)
     return out
-
-
-def spring_lengths_m(log: Log, spec: ArmSpec) -> np.ndarray | None:
-    """Return the spring lengths (n, n_springs) [m] of a log, NaN where a reading is not believed."""
-    return log.lengths_m(spec.spring_sensor)
 
 
 def volumes_m3(spring_m: np.ndarray | None, n: int, spec: ArmSpec) -> np.ndarray:
