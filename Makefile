@@ -9,7 +9,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed-$(EXTRAS)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint docs bench clean .venv
+.PHONY: help demo test test-slow lint docs clean .venv
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -34,10 +34,6 @@ lint: $(INSTALLED) .venv/.installed-dev  ## ruff, which corrects what it can, an
 
 docs: .venv/.installed-docs  ## the site, links checked, into build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-
-bench: $(INSTALLED)  ## the benchmarks
-	$(BIN)/python -m benchmarks throughput
-	$(BIN)/python -m benchmarks settle
 
 clean:  ## remove virtual environments, build outputs and caches; runs/ stays
 	rm -rf .venv .venv-* build dist *.egg-info .pytest_cache .ruff_cache

@@ -109,12 +109,12 @@ def confined_targets() -> list[Target]:
     return [
         *(Target("pipe", (shown,), f"{axis}_mm", 5.0) for axis in "xyz"),
         Target("pipe", (shown, exchanged), "all_done", 8 / 9, both_orders, **share),
-        Target("narrow", (shown,), "all_done", 7 / 9, **share),
+        Target("narrow-learned", (shown,), "all_done", 7 / 9, **share),
         Target("pipe", (moving,), "all_done", 8 / 9, **share),
         Target("pipe", (moving,), "seconds", 0.5, of=("pipe", shown)),
         Target("pipe", (shown, exchanged), "calm_percent", 99.0, np.min, at_least=True),
         Target("pipe", (moving,), "calm_percent", 99.0, np.min, at_least=True),
-        Target("narrow", (shown,), "calm_percent", 99.0, np.min, at_least=True),
+        Target("narrow-learned", (shown,), "calm_percent", 99.0, np.min, at_least=True),
     ]
 
 

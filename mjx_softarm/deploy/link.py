@@ -65,7 +65,7 @@ class Link:
         """
         if not self._simulated:
             return time.monotonic()
-        time_s = self._call("time_s", lambda: float(self._arm.time_s))
+        time_s = self._call("time_s", lambda: float(self._arm.time_s), timeouts=False)
         if not np.isfinite(time_s):
             raise ArmFault(f"time_s: got {time_s}, expected a finite number")
         return time_s
