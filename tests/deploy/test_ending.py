@@ -130,6 +130,13 @@ def test_every_error_of_every_method(command, method, error, cause):
     assert arm.n_rows <= len(log) <= arm.n_rows + 1
 
 
+@pytest.mark.parametrize("method", ["time_s", "pressures"])
+def test_a_timeout_is_named_where_the_loop_cannot_go_on(method):
+    arm = Faulty(raises(TimeoutError("bus")), method, range(20, 21))
+    ending = drive("run", arm)[0]
+    assert vented(arm) and ending.status == 3 and ending.cause == f"{method}: bus"
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [np.full(N, np.nan), np.zeros(5), "text", None])
 def test_impossible_values(method, value):
