@@ -24,7 +24,7 @@ from train.runs.plots import BLUE, GREY, INK, ORANGE, dress
 
 GREEN, RED = "#2a9d6f", "#c43333"
 COLOURS = {"without": ORANGE, "with": BLUE, "gradient": GREEN}  # of the kinds on the circle
-PAPER_LOADS = (35, 500, 1000), (9.0, 9.0, 23.76)  # [g], [mm] of the paper's arm
+PAPER_MEANS, PAPER_LARGEST = ((35, 500), (9.0, 9.0)), (1000, 23.76)  # [g], [mm] of the paper's arm
 WIDTH, HEIGHT = 240, 320  # of a picture of a film [px]
 PERIOD_S = 1.0  # simulated time between two pictures
 MAX_FRAMES, FRAME_MS, N_COLOURS = 120, 80, 128
@@ -74,7 +74,8 @@ def loads_figure(rows: Sequence[Row], arm: str) -> Figure:
         panel.plot([r["load_g"] for r in runs], [r["translation_mm"] for r in runs], ".", color=f"C{k}")
         panel.plot(list(by_load), mean, color=f"C{k}", label=KINDS[kind].title)
         panel.vlines(list(by_load), mean, largest, color=f"C{k}", alpha=0.35)
-    panel.plot(*PAPER_LOADS, "x--", color=GREY, label="the paper's arm: mean; at 1 kg largest")
+    panel.plot(*PAPER_MEANS, "x--", color=GREY, label="the paper's arm: mean")
+    panel.plot(*PAPER_LARGEST, "^", color=GREY, label="the paper's arm: largest error")
     panel.legend(frameon=False, fontsize=8)
     return figure
 
