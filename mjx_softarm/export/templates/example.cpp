@@ -34,7 +34,7 @@ int main() {
   const double goal[6] = {@GOAL@};  // x, y, z [mm], yaw, pitch, roll [deg]
   float nearest[6];
   softarm::Controller controller;
-  if (!softarm::reaches(goal, nearest) || !controller.set_goal(goal)) return 3;  // outside the workspace
+  if (!softarm::reaches(goal, nearest) || !controller.set_goal(goal)) return 1;  // outside the workspace
   const std::chrono::duration<double> period(softarm::kPeriod);
   bool late = false, taken = true;
   softarm::Tick tick{};
