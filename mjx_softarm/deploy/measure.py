@@ -289,18 +289,19 @@ def print_figures(numbers: dict[str, Any]) -> None:
     stops = f"{numbers['measured']} of {numbers['points']} goals"
     if "way_s" in numbers:
         print(
-            f"path in {numbers['way_s']:.0f} s: mean {numbers['way_mm']:.2f} mm, 95 % below "
+            f"path in {numbers['way_s']:.0f} s: mean error {numbers['way_mm']:.2f} mm, 95 % below "
             f"{numbers['way_95_mm']:.2f}, at most {numbers['way_max_mm']:.2f}; "
-            f"{numbers['lag_s']:.2f} s behind, without that {numbers['way_without_lag_mm']:.2f}"
+            f"delay {numbers['lag_s']:.2f} s, mean error without it {numbers['way_without_lag_mm']:.2f} mm"
         )
         stops = f"{numbers['measured']} stops"
     parts = [
-        f"mean {numbers[f'{name}_{unit}']:.2f} {unit}, 95 % below {numbers[f'{name}_95_{unit}']:.2f}, "
+        f"mean error {numbers[f'{name}_{unit}']:.2f} {unit}, 95 % below {numbers[f'{name}_95_{unit}']:.2f}, "
         f"at most {numbers[most]:.2f}"
         for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg"))
         if not np.isnan(numbers[f"{name}_{unit}"])  # goals ask for it
     ]
-    parts.append(f"saturated chambers at {numbers['saturated_points'] or 'none'}")
+    n_saturated = numbers["saturated_points"]
+    parts.append(f"saturated chambers at {n_saturated} of them" if n_saturated else "no chamber saturated")
     print(f"{stops}: {'; '.join(parts)}")
 
 
