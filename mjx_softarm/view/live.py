@@ -70,7 +70,7 @@ class TakenPoses:
         self._rows.add({"time_s": row["time_s"], "readings": row["readings"], "sequence": 0} | tip)
         self._last = pose
         place = ", ".join(f"{value:.0f}" for value in pose[:3])
-        return f"pose {len(self)} taken: tip at {place} mm, {'seen' if seen else 'believed'}"
+        return f"pose {len(self)} taken: tip at {place} mm, {'measured' if seen else 'estimated'}"
 
     def log(self) -> Log:
         """Return the poses as a log."""

@@ -28,8 +28,8 @@ class Panel:
         with gui.add_folder("Chambers and springs"):
             self._bars = gui.add_html("")
         with gui.add_folder("Traces"):
-            lines = ("believed", css(GOAL)), ("seen", css(SEEN))
-            self._errors = plot(gui, "tip error [mm], violet: seen", lines)
+            lines = ("estimated", css(GOAL)), ("measured", css(SEEN))
+            self._errors = plot(gui, "tip error [mm], violet: measured", lines)
             colours = section_colours(spec, spec.n_chambers)
             lines = [(f"chamber {k}", css(colour)) for k, colour in enumerate(colours)]
             self._pressures = plot(gui, "pressures [kPa]", lines)
@@ -53,7 +53,7 @@ class Panel:
         rows = ""
         if look is not None and np.isfinite(look.tip).all():
             rows = "tip at {:.1f}, {:.1f}, {:.1f} mm; {:.1f}, {:.1f}, {:.1f}°".format(*look.tip)
-            offs = (("believed", look.error_mm(look.estimate)), ("seen", look.error_mm(look.seen)))
+            offs = (("estimated", look.error_mm(look.estimate)), ("measured", look.error_mm(look.seen)))
             known = [(name, off_mm) for name, off_mm in offs if np.isfinite(off_mm)]
             rows += "".join(
                 f"<br>tip <b>{off_mm:.1f} mm</b> from the goal, as {name}" for name, off_mm in known

@@ -74,7 +74,7 @@ def test_goal_is_dragged_and_the_arm_stopped_and_vented(browser, live):
         page.mouse.move(x, y - 6 * k)
         page.wait_for_timeout(50)
     page.mouse.up()
-    says(page, "from the goal, as believed")
+    says(page, "from the goal, as estimated")
     press(page, "Vent")
     says(page, "The arm has no pressure")
     page.close()

@@ -37,12 +37,12 @@ def row(time_s, pose=POSE, **others):
 
 def test_poses_are_what_imitation_takes(tmp_path):
     demos = TakenPoses(POLICY)
-    assert demos.take(HOLDS, row(1.0)) == "pose 1 taken: tip at 20, -10, -600 mm, believed"
+    assert demos.take(HOLDS, row(1.0)) == "pose 1 taken: tip at 20, -10, -600 mm, estimated"
     assert "expected another" in demos.take(HOLDS, row(2.0, POSE + 0.5))
     seen = {"tip_m": np.array([0.0, 0.03, -0.6]), "tip_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
-    assert demos.take(HOLDS, row(3.0, **seen)).endswith("tip at 0, 30, -600 mm, seen")
+    assert demos.take(HOLDS, row(3.0, **seen)).endswith("tip at 0, 30, -600 mm, measured")
     missed = {"tip_m": np.full(3, np.nan), "tip_quaternion": np.full(4, np.nan)}
-    assert demos.take(HOLDS, row(4.0, **missed)).endswith("believed")
+    assert demos.take(HOLDS, row(4.0, **missed)).endswith("estimated")
     write_log(tmp_path / "demos.csv", demos.log())
     found = load_demonstrations(tmp_path / "demos.csv", SPEC)
     np.testing.assert_allclose(found.positions, [POSE, [0, 30, -600, 0, 0, 0], POSE], atol=1e-3)
