@@ -250,19 +250,20 @@ def _stretches(table: np.ndarray) -> np.ndarray:
 
 
 def _warnings(fit: LineFit, spread: np.ndarray) -> tuple[str, ...]:
-    """Return reasons not to trust lines of predictors with standard deviations (k,), each with its remedy."""
+    """Return reasons not to trust the lines, each with its remedy; predictors spread by (k,)."""
     warnings = []
     for k in range(len(fit.slope)):
-        n, held_out, noise, rms = fit.n_rows[k], fit.held_out_rms[k], fit.noise[k], fit.rms[k]
-        range_y = abs(fit.slope[k]) * spread[k]
+        n = fit.n_rows[k]
+        held_out, noise, rms = (1e3 * error[k] for error in (fit.held_out_rms, fit.noise, fit.rms))  # [mm]
+        range_y = 1e3 * abs(fit.slope[k]) * spread[k]
         width = fit.slope_width[k] / abs(fit.slope[k])
         reasons = {
             f"got {n} rows, expected {MIN_ROWS} or more: measure more": n < MIN_ROWS,
-            f"lengths spread by {range_y:.3g} only, noise being {noise:.3g}, so slope and offset can hardly "
+            f"lengths spread by {range_y:.3g} mm only, noise being {noise:.3g} mm, so slope and offset can hardly "
             "be separated: measure over the whole range": range_y < 5 * noise,
-            f"held-out error {held_out:.3g} extrapolates in {100 * fit.beyond[k]:.0f} % of rows: measure the "
+            f"held-out error {held_out:.3g} mm extrapolates in {100 * fit.beyond[k]:.0f} % of rows: measure the "
             "shortest and the longest lengths more than once, at different times": fit.beyond[k] > MAX_BEYOND,
-            f"held-out error {held_out:.3g}, on its own rows {rms:.3g}: measure more rows, in random order": (
+            f"held-out error {held_out:.3g} mm, on its own rows {rms:.3g} mm: measure more rows, in random order": (
                 not held_out < 1.5 * rms
             ),
             f"slope known to {100 * width:.2g} % only: measure more rows, over a wider range": (

@@ -94,8 +94,8 @@ class DriverOptions:
         """Open the driver of an arm with this specification, and its motion capture."""
         driver = open_arm(self.arm)
         if self.arm.startswith("twin:") and ArmSpec.of(twin_spec(self.arm)).geometry != spec.geometry:
-            other = f"a twin of another arm than {spec.name!r}, whose twins are twin:SEED@ARM.toml"
-            tell(f"{self.arm} is {other}")
+            remedy = "give the other arm's policy, or the twin of this arm, twin:SEED@ARM.toml"
+            tell(f"{self.arm} is a twin of another arm than {spec.name!r}: {remedy}")
         return with_capture(driver, self.capture, spec, tell)
 
 
@@ -137,7 +137,7 @@ def _run(
 
     save = partial(save_log, log) if log else lambda log: None
     run = follow(driver, controller, goals, duration, tell, save=save, stay=stay)
-    if log and run.ending.status != cli.ERROR:
+    if log and len(run.log) and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver)
     print_run(run, controller.policy)
@@ -250,8 +250,6 @@ def _record(
     twin = twin_spec(options.arm)
     arm_spec = ArmSpec.of(spec or twin)
     check_file("--out", out)
-    if out.exists():
-        raise InputError(f"--out: got {out}, which is there already, expected a new file")
 
     driver = options.open(arm_spec)
     check_number(driver, arm_spec, f"--arm {options.arm}")
@@ -259,6 +257,8 @@ def _record(
     default = "" if spec or twin else ", by default; --spec names another arm"
     tell(f"arm: {arm_spec.name}, {arm_spec.n_chambers} chambers, {low:g} to {high:g} kPa{default}")
     tell(ACCURACY)
+    if not hasattr(driver, "motion_capture"):
+        tell("no motion capture: this log calibrates the springs alone; --capture adds it")
 
     targets_kpa = growing(random_pressures(arm_spec, poses, seed))
     result = record(driver, arm_spec, targets_kpa, tell, partial(save_log, out))

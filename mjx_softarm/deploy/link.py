@@ -149,6 +149,8 @@ class Link:
             seen = self._arm.motion_capture()
         except OSError:  # a missed frame is a gap in the log
             return {}
+        if not isinstance(seen, Capture):
+            raise ValueError(f"got {type(seen).__name__}, expected mjx_softarm.deploy.arm_io.Capture")
         return {name: np.array(value, float) for name, value in seen._asdict().items() if value is not None}
 
     def _call(self, name: str, method: Callable[[], Any], timeouts: bool = True) -> Any:

@@ -54,11 +54,15 @@ def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
         return np.asarray(pose_from_frame(position_m, np.broadcast_to(turn, (n, 3, 3))))
     if name == "grid":
         return grid_poses(policy.workspace, n)
+    if not Path(name).is_file():
+        raise InputError(f"--goals: got {name}, expected circle, grid or a CSV file")
     table = read_table(name)
-    known = table.names in (GOAL_COLUMNS, GOAL_COLUMNS[:3])
-    if not known or not np.isfinite(table.values).all():
-        expected = f"numbers in the columns {','.join(GOAL_COLUMNS)}, or in the first three"
+    if table.names not in (GOAL_COLUMNS, GOAL_COLUMNS[:3]):
+        expected = f"the columns {','.join(GOAL_COLUMNS)}, or the first three"
         raise InputError(f"{name}: got {','.join(table.names)}, expected {expected}")
+    for row, column in np.argwhere(~np.isfinite(table.values))[:1]:
+        where = f"{name}: row {table.row[row]}: {table.names[column]}"
+        raise InputError(f"{where}: got {table.values[row, column]}, expected a finite number")
     return np.array([whole_goal(goal, policy, name) for goal in table.values])
 
 

@@ -164,7 +164,9 @@ class _Session:
 
     def to_end(self, save: Callable[[Log], None]) -> LoopRun:
         """Run, vent and save the log; return the results."""
-        ending = vent_at_end(self._run, self.link, self.tell, lambda: save(self._log()))
+        ending = vent_at_end(
+            self._run, self.link, self.tell, lambda: save(self._log()) if len(self.rows) else None
+        )
         return LoopRun(
             self._log(),
             tuple(self.arrivals),

@@ -149,7 +149,7 @@ def _absent(
 
 
 def check_file(option: str, path: Path | None, endings: Sequence[str] = TABLES) -> None:
-    """Refuse a file that could not be written, or whose ending names another format, before the arm moves."""
+    """Refuse a file that exists, could not be written, or is of another format, before the arm moves."""
     if path is None:
         return
     if path.suffix and path.suffix not in endings:
@@ -158,3 +158,5 @@ def check_file(option: str, path: Path | None, endings: Sequence[str] = TABLES) 
         raise InputError(f"{option}: got {path}, expected a file in a folder that exists")
     if path.is_dir():
         raise InputError(f"{option}: got {path}, a folder, expected a file")
+    if path.exists():
+        raise InputError(f"{option}: got {path}, which is there already, expected a new file")

@@ -1,5 +1,7 @@
 """Check of the wiring by a log: does each chamber move the springs beside it? NumPy only.
 
+Where lengths were measured, too: does each spring's reading follow its own length?
+
 A line through rows of random poses gives the change of each spring with each pressure. It should be a stretch
 of the chamber's section and a bend away from the chamber. A chamber whose changes are more like those of
 another one has a valve, or springs have sensors, of another number.
@@ -23,15 +25,40 @@ LEAST_CHANGE = 0.1  # change of the springs by a chamber, over the largest, belo
 LEAST_M = 1e-5  # standard deviation of a spring that changes
 MARGIN = 0.3  # by which the changes have to be more like those of another chamber
 STRETCH = 0.3  # stretch of a section over its bend, at the springs
+RULER_ROWS = 20  # fewer rows with a measured length show nothing
+FOLLOWS, STRAYS = 0.9, 0.5  # correlations of a length with readings: of its spring, and not of its spring
 
 
 def wiring_faults(log: Log, spec: ArmSpec) -> list[str]:
     """Return what a log says against the wiring: "got X, expected Y", empty if it says nothing."""
-    # Rows with commands that change from chamber to chamber
-    kpa = log.pressure_kpa if log.commanded_kpa is None else log.commanded_kpa
-    if kpa is None or log.readings is None:
+    if log.readings is None:
         return []
     spring_m = spec.spring_sensor.lengths(log.readings, np.nan).length_m
+    return [*_exchanged_lengths(log.spring_m, spring_m), *_exchanged_chambers(log, spring_m, spec)]
+
+
+def _exchanged_lengths(ruler_m: np.ndarray | None, spring_m: np.ndarray) -> list[str]:
+    """Compare measured lengths (n, n_springs), if there are any, with those by the readings."""
+    faults = []
+    for k, length_m in enumerate([] if ruler_m is None else ruler_m.T):
+        rows = np.isfinite(length_m) & np.isfinite(spring_m).all(axis=1)
+        table = np.column_stack([length_m, spring_m])[rows]
+        if len(table) < RULER_ROWS or table.std(axis=0).min() < LEAST_M:
+            continue
+        alike = np.corrcoef(table.T)[0, 1:]
+        best = int(alike.argmax())
+        if alike[k] < STRAYS and alike[best] > FOLLOWS:
+            expected = "expected its own: columns or sensors have other numbers"
+            faults.append(f"got lengths of spring{k} that follow the readings of spring{best}, {expected}")
+    return faults
+
+
+def _exchanged_chambers(log: Log, spring_m: np.ndarray, spec: ArmSpec) -> list[str]:
+    """Compare the springs' lengths (n, n_springs) with the pressures."""
+    # Rows with commands that change from chamber to chamber
+    kpa = log.pressure_kpa if log.commanded_kpa is None else log.commanded_kpa
+    if kpa is None:
+        return []
     known = np.isfinite(spring_m).all(axis=1) & np.isfinite(kpa).all(axis=1)
     kpa, spring_m = kpa[known], spring_m[known]
     n, c = kpa.shape

@@ -56,6 +56,7 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
     [
         ("twin", "expected twin:SEED, wiring.toml or package.module:Class"),
         ("twin:0:pipe220", "got 'pipe220', expected one of pipe300"),
+        ("twin:rod:0:lost9", "got lost9, expected a chamber of this arm, lost0 to lost8"),
         ("twin:rod:0@", "got no arm"),
         ("no_such_module:Arm", "got No module named"),
         ("mjx_softarm.deploy.loop:Nothing", "got module .* has no attribute 'Nothing'"),
@@ -134,6 +135,8 @@ def test_command_line_runs_without_jax(folder):
         ("run no.npz", "no.npz: got 'No such file"),
         ("run policy.npz --log no/a.csv", "expected a file in a folder"),
         ("run policy.npz --log a.xlsx", "expected a name that ends in .csv or .npz"),
+        ("run policy.npz --log policy.npz", "expected a new file"),
+        ("measure policy.npz --out new --goals circel", "got circel, expected circle, grid or a CSV file"),
         ("record --out policy.npz", "expected a new file"),
         ("measure policy.npz --out .", "expected a new folder"),
         ("measure policy.npz --out new", "without the method motion_capture"),
@@ -153,7 +156,11 @@ def test_command_line_tells_what_is_wrong(words, message, here, capsys):
         ("record --arm twin:7 --spec wide.toml --out a.csv --poses 1", 0, "another arm than 'wide'"),
         (f"run --arm its:Arm {FAR_AWAY}", 1, "policy: the package's own|goal outside the workspace"),
         (f"run policy.npz --arm its:Arm {MISSED}", 1, " NOT REACHED, |the policy is not calibrated"),
-        ("record --arm its:Arm --out a.csv --poses 9", 3, "log: a.csv, 453 rows|ended early: sensors: got 3"),
+        (f"run --arm its:Arm {FAR_AWAY} --log a.csv", 1, "goal outside the workspace"),
+        (
+            *("record --arm its:Arm --out a.csv --poses 9", 3),
+            "this log calibrates the springs alone|log: a.csv, 453 rows|ended early: sensors: got 3",
+        ),
     ],
 )
 def test_lines_of_commands(words, status, lines, tmp_path, monkeypatch, capsys):
@@ -172,7 +179,7 @@ def test_lines_of_commands(words, status, lines, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("n", "reading", "message"),
     [
-        (6, REST_M, "got 6 readings, expected 9"),
+        (6, REST_M, "read_sensors: got 6 readings, expected 9"),
         (9, None, "got readings of 1 to 1 Hz, expected "),
         (9, 0.3, "got springs of 300 mm in the mean without pressure, expected 200 mm"),
     ],

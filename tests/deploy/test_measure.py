@@ -145,7 +145,10 @@ def test_goals_by_name(tmp_path):
     file.write_text("x [mm],y [mm],z [mm],yaw [deg],pitch [deg],roll [deg]\n80,0,-575,0,0,0\n1,2,3,4,5,6\n")
     np.testing.assert_array_equal(read_goals(str(file), POLICY, 1)[1], range(1, 7))
     file.write_text("x,y,z\n1,2,3\n")
-    with pytest.raises(InputError, match=r"goals.csv: got x,y,z, expected numbers in the columns x \[mm\]"):
+    with pytest.raises(InputError, match=r"goals.csv: got x,y,z, expected the columns x \[mm\]"):
+        read_goals(str(file), POLICY, 1)
+    file.write_text("x [mm],y [mm],z [mm]\n80,0,-575\n1,,3\n")
+    with pytest.raises(InputError, match=r"goals.csv: row 3: y \[mm\]: got nan, expected a finite number"):
         read_goals(str(file), POLICY, 1)
 
 

@@ -53,6 +53,17 @@ def test_a_log_of_exchanged_sensors_is_named_and_refused_if_strict(log, tmp_path
     assert f"{path}: wiring: got chamber0 that moves" in capsys.readouterr().err
 
 
+def test_lengths_of_another_spring_are_named(log):
+    """Lengths that were measured with a ruler, in a table whose columns were exchanged."""
+    ruler_m = SPEC.spring_sensor.lengths(log.readings, np.nan).length_m
+    assert wiring_faults(dataclasses.replace(log, spring_m=ruler_m), SPEC) == []
+    exchanged = dataclasses.replace(log, spring_m=ruler_m[:, [0, 1, 2, 4, 3, 5, 6, 7, 8]])
+    faults = wiring_faults(exchanged, SPEC)
+    assert len(faults) == 2
+    assert "lengths of spring3 that follow the readings of spring4" in faults[0]
+    assert "lengths of spring4 that follow the readings of spring3" in faults[1]
+
+
 def test_no_air_a_closed_valve_and_a_loose_sensor_are_named(log):
     noise_hz = 50.0 * np.random.default_rng(0).normal(size=log.readings.shape)
     still_hz = log.readings[0] + noise_hz

@@ -19,7 +19,6 @@ import numpy as np
 import tyro
 
 from mjx_softarm._support import cli
-from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.drive import Drive, Hold
 from mjx_softarm.deploy.drivers import names
@@ -172,8 +171,6 @@ class Record(ArmOptions):
         console = start()
         say = console.print
         check_file("--out", self.out)
-        if self.out.exists():
-            raise InputError(f"--out: got {self.out}, which is there already, expected a new file")
         # Plan all postures before the arm moves.
         spec, s2r, _ = self.read_arm(console)
         arm = names.open_arm(self.arm)

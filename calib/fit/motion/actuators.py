@@ -333,7 +333,7 @@ def _warnings(done: ActuatorFit, solution: Solution) -> tuple[str, ...]:
     converged = solution.decrement < 0.5 * SMALL_STEP**2 * len(solution.x)
     said = [] if converged else ["the fit did not converge: log for longer"]
     said += [
-        f"{name} is known to {100 * share:.0f} % only: log larger steps of the commands"
+        f"{name} is known to {100 * share:.0f} % only: record more poses"
         for name, share in _uncertain(done).items()
         if name not in _RATES
     ]

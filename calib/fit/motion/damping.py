@@ -224,7 +224,7 @@ def _warnings(done: DampingFit, widths: np.ndarray, converged: bool) -> tuple[st
     said = [] if converged else [NOT_CONVERGED]
     for name, width in zip(done.half_width_95, widths, strict=True):
         if width > KNOWN:
-            said.append(f"{name} is known to {100 * width:.0f} % only: log larger steps of the pressures")
+            said.append(f"{name} is known to {100 * width:.0f} % only: record more poses")
     if done.held_out_rms_mm > MAX_RATIO * done.in_sample_rms_mm:
         said.append(
             f"held-out error {done.held_out_rms_mm:.1f} mm is more than {MAX_RATIO:g} times the error of the "

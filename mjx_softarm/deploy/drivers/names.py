@@ -123,8 +123,9 @@ def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
     except Exception:  # a driver may raise anything
         return None
     if readings.shape != (spec.n_springs,):
+        got = " x ".join(map(str, readings.shape)) + " readings" if readings.ndim else f"{readings}"
         raise InputError(
-            f"{name}: got {' x '.join(map(str, readings.shape))} readings, expected {spec.n_springs}, of "
+            f"{name}: read_sensors: got {got}, expected {spec.n_springs} readings, of "
             f"the {spec.structure.n_sections} sections of {spec.name!r}; {_ANOTHER}?"
         )
     return readings
