@@ -263,7 +263,7 @@ def _warnings(fit: LineFit, spread: np.ndarray) -> tuple[str, ...]:
             "hardly be separated: measure over the whole range": range_y < 5 * noise,
             f"held-out error {held_out:.3g} mm extrapolates in {100 * fit.beyond[k]:.0f} % of rows: measure "
             "the shortest and longest lengths more than once, at different times": fit.beyond[k] > MAX_BEYOND,
-            f"held-out error {held_out:.3g} mm, on its own rows {rms:.3g} mm: measure more, in random order": (
+            f"held-out error {held_out:.3g} mm, on its own rows {rms:.3g} mm: measure more, at random": (
                 not held_out < 1.5 * rms
             ),
             f"slope known to {100 * width:.2g} % only: measure more rows, over a wider range": (
