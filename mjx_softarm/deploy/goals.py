@@ -70,7 +70,8 @@ def refusals(policy: Policy, goals: Sequence[np.ndarray]) -> dict[int, Event]:
     refused = {}
     for k, pose, error in zip(finite, poses, errors, strict=True):
         if not error <= policy.reward.threshold:
-            got, near = (", ".join(f"{value:.4g}" for value in values) for values in (goals[k], pose))
+            got = ", ".join(f"{value:g}" for value in goals[k])
+            near = ", ".join(f"{value:.0f}" for value in pose)
             message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
             refused[k] = Event(Fault.GOAL_OUTSIDE, message)
     return refused

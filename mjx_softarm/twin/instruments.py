@@ -79,6 +79,9 @@ class InstrumentedArm(abc.ABC):
         self._spec = spec
         self._sensor = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m)
         self._scale = build.noise
+        n = spec.n_chambers
+        if build.lost is not None and build.lost >= n:
+            raise ValueError(f"got lost{build.lost}, expected a chamber of this arm, lost0 to lost{n - 1}")
         self._lost = build.lost
         self._rng = np.random.default_rng([session, seed])
         self.time_s = 0.0

@@ -30,19 +30,11 @@ def twin_of(name: str) -> Twin | RodTwin:
     name, build, lost, grams = match.groups()
     build = _BUILDS[build]._replace(lost=None if lost is None else int(lost))
     payload_kg = 1e-3 * int(grams or 0)
-
-    def check_lost(spec: ArmSpec | None) -> None:
-        n = (spec or ArmSpec.default()).n_chambers
-        if lost and int(lost) >= n:
-            raise ValueError(f"twin: got lost{lost}, expected a chamber of this arm, lost0 to lost{n - 1}")
-
     if name.startswith(f"{ROD}:"):
         number, spec = _seed_and_arm(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED")
-        check_lost(spec)
         return RodTwin(number, spec, payload_kg, build=build)
     rest, colon, pipe = name.partition(":")
     number, spec = _seed_and_arm(rest, "twin:SEED")
-    check_lost(spec)
     if colon and pipe not in PIPES:
         raise ValueError(
             f"twin:{rest}: got {pipe!r}, expected one of {', '.join(PIPES)}, then aged or exact, then a "

@@ -157,6 +157,7 @@ def test_command_line_tells_what_is_wrong(words, message, here, capsys):
         (f"run --arm its:Arm {FAR_AWAY}", 1, "policy: the package's own|goal outside the workspace"),
         (f"run policy.npz --arm its:Arm {MISSED}", 1, " NOT REACHED, |the policy is not calibrated"),
         (f"run --arm its:Arm {FAR_AWAY} --log a.csv", 1, "goal outside the workspace"),
+        ("run --arm its:Arm --goal=0,0,-0.5,0,0,0", 1, "got 0, 0, -0.5, 0, 0, 0, expected a pose"),
         (
             *("record --arm its:Arm --out a.csv --poses 9", 3),
             "this log calibrates the springs alone|log: a.csv, 453 rows|ended early: sensors: got 3",

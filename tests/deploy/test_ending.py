@@ -137,6 +137,17 @@ def test_a_timeout_is_named_where_the_loop_cannot_go_on(method):
     assert vented(arm) and ending.status == 3 and ending.cause == f"{method}: bus"
 
 
+def test_a_frame_that_is_no_capture_is_named():
+    class Bare(LinearArm):
+        def motion_capture(self):
+            return np.zeros(7)
+
+    arm = Bare()
+    run = go(arm, goals=GOALS[:1])
+    assert run.status == 3 and not arm.command_kpa.any()
+    assert run.ending.cause == "motion_capture: got ndarray, expected mjx_softarm.deploy.arm_io.Capture"
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [np.full(N, np.nan), np.zeros(5), "text", None])
 def test_impossible_values(method, value):

@@ -335,8 +335,14 @@ def readme_rows():
 
 TABLES = {
     "docs/results.md": (
-        *(main_rows, circle_rows, load_rows, lap_rows, pipe_rows, held_out_rows, calibration_rows),
-        *(missed_rows,),
+        main_rows,
+        missed_rows,
+        circle_rows,
+        load_rows,
+        lap_rows,
+        pipe_rows,
+        held_out_rows,
+        calibration_rows,
     ),
     "docs/trust.md": (arm_rows,),
     "docs/speed.md": (race_rows, step_rows, gpu_rows),
